@@ -12,7 +12,6 @@ from omegaconf import OmegaConf
 from forewarp.data import dnerf, hypernerf, nhr, posed_video
 from forewarp.data.module import SceneDataModule
 from forewarp.methods.particles.options import Effects
-from forewarp.methods.voxel.effects import LearnedUpsampler, UNet3d, ViewNetwork
 from forewarp.methods.voxel.forward import ForwardWarp
 from forewarp.methods.voxel.structure import VoxelStage
 from forewarp.renderer import Renderer
@@ -86,22 +85,6 @@ def test_effects_of_particles_are_switched():
 def test_every_command_has_a_config(name):
     config = composed("data.scene=x", name=name) if name == "train" else composed(name=name)
     assert OmegaConf.to_container(config, resolve=True, throw_on_missing=True)["paths"]
-
-
-def test_faithful_is_the_papers_method():
-    run = run_of("model=forward", "preset=faithful")
-    method, (coarse, fine) = method_of(run.model, frames=40), run.stages
-    assert (type(method.inpainter), method.inpainter.width) == (UNet3d, 64)
-    assert isinstance(method.upsampler, LearnedUpsampler)
-    assert isinstance(method.view_dependence, ViewNetwork)
-    assert (method.motion.trajectory.bases, method.motion.trajectory.at_nodes) == (15, False)
-    assert (coarse.settings.iterations, fine.settings.iterations) == (20_000, 100_000)
-    first, last = coarse.settings.numbers, fine.settings.numbers
-    assert (first["start_alpha"], last["start_alpha"], first["box_alpha"]) == (1e-6, 1e-2, 1e-3)
-    assert first["effects"] == ["motion", "background"]
-    assert not last["carry"]
-    assert coarse.objective.weights["tv_depth"] == fine.objective.weights["tv_depth"] == 1e-1
-    assert (coarse.objective.weights["point_color"], fine.objective.weights["point_color"]) == (1e-1, 1e-2)
 
 
 @pytest.mark.parametrize("preset", PRESETS)
@@ -185,12 +168,6 @@ def test_every_section_of_numbers_composes_and_instantiates(model, preset, exper
         # Trained over the background that they are measured on.
         assert (config.data.background, config.data.eval_background) == ("black", "black")
         assert config.model.get("camera") == (True if "tineuvox" in model else None)
-
-
-@pytest.mark.parametrize("model", MODELS)
-def test_every_method_composes_and_instantiates(model):
-    """Shares its compositions with tests/test_defaults.py."""
-    assert [stage.settings.name for stage in run_of(f"model={model}", "preset=faithful").stages]
 
 
 @pytest.mark.parametrize("model", ["forward", pytest.param("backward", marks=pytest.mark.slow)])

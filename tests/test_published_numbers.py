@@ -283,7 +283,11 @@ FORWARD = {
         "model.trajectory.nodes": 0,
         "model.trajectory.padding": 0,
     },
-    "A.2 F3": {"model.inpainter.levels": 4, "model.inpainter.coverage_channel": False},
+    "A.2 F3": {
+        "model.inpainter.levels": 4,
+        "model.inpainter.width": 64,
+        "model.inpainter.coverage_channel": False,
+    },
     "A.2 F4": {
         "model.view_dependence.features": 12,
         "model.view_dependence.frequencies": 4,
@@ -297,6 +301,12 @@ FORWARD = {
         "objective.fine.weights": WEIGHTS_FORWARD
         | NONE_PRINTED
         | {"point_color": 1e-2, "background_entropy": 1e-3, "inpaint_diff": 1e-5},
+    },
+    "A.4 opacity at first": {
+        "stage.coarse.start_alpha": 1e-6,
+        "stage.coarse.box_alpha": 1e-3,
+        "stage.fine.start_alpha": 1e-2,
+        "stage.fine.carry": False,
     },
     "A.4 ten images, and one more every 60 iterations": {
         "stage.fine.curriculum.start": 10,

@@ -55,8 +55,7 @@ def test_a_step_on_what_is_occupied_learns_what_the_dense_one_learns():
     assert float((inside - everywhere)[present].abs().max()) < 1e-3 * scale
 
 
-@pytest.mark.parametrize("dense", [False, True])
-@pytest.mark.parametrize("name", ["splat", "fields", "inpaint"])
+@pytest.mark.parametrize(("name", "dense"), [("splat", True), ("fields", False), ("inpaint", False)])
 def test_every_operator_can_be_timed(name, dense):
     seen = []
     with torch.autograd.graph.saved_tensors_hooks(lambda t: seen.append(t) or t, lambda t: t):
@@ -124,14 +123,9 @@ def test_tables_of_particles_are_made(monkeypatch):
     lines = particles.effects_table(TINY).splitlines()[2:]
     assert [line.split("|")[1].strip() for line in lines] == list(particles.ALONE)
     assert all(float(cell) > 0 for line in lines for cell in line.split("|")[2:-1])
+    assert min(particles.lightning_shares(TINY, 4)) > 0
     monkeypatch.setattr(particles, "lightning_shares", lambda size, steps: (0.010, 0.007))
     assert "| 70%: 10 and 7 ms | **missed** |" in particles.goals_table(TINY)
-
-
-def test_steps_within_lightning_and_without_are_timed():
-    within, bare = particles.lightning_shares(TINY, 4)
-    assert within > 0
-    assert bare > 0
 
 
 @pytest.mark.slow
@@ -144,13 +138,11 @@ def test_a_start_is_timed_by_its_parts(tmp_path):
 
 def test_a_step_with_published_numbers_is_counted_and_timed(fitted):
     scene = fitted.parent / "scenes" / "vehicle"
-    few, many = (measured("tnerf", scene, rays) for rays in (4, 8))
-    assert [(step["rays"], step["of"]) for step in (few, many)] == [(4, 500), (8, 500)]
-    assert many["flop"] == 2 * few["flop"] > 0
-    assert few["parameters"] == many["parameters"] == 600_452
-    assert few["seconds"] > 0
-    assert few["bytes"] > 12 * few["parameters"]  # with gradients and Adam's moments
-    assert set(json.loads(json.dumps(few))) == set(FIELDS)
+    step = measured("tnerf", scene, 4)
+    assert (step["rays"], step["of"], step["parameters"]) == (4, 500, 600_452)
+    assert min(step["flop"], step["seconds"]) > 0
+    assert step["bytes"] > 12 * step["parameters"]  # with gradients and Adam's moments
+    assert set(json.loads(json.dumps(step))) == set(FIELDS)
 
 
 def test_a_method_that_failed_says_why_in_its_row(tmp_path):

@@ -66,11 +66,10 @@ def solid(opacity, side=4, **options):
     return Volumes(template, warp)
 
 
-@pytest.mark.parametrize(("cameras", "count"), [(4, 114_807_524 + 4 * 6), (1, 105_492_964 + 6)])
-def test_published_counts(cameras, count):
-    scene = rig() if cameras == 4 else moving_scene()
+def test_published_count_of_four_cameras():
     with torch.device("meta"):
-        assert parameter_count(NeuralVolumes(Start(scene, "fine", {}, blank=True))) == count
+        made = NeuralVolumes(Start(rig(), "fine", {}, blank=True))
+    assert parameter_count(made) == 114_807_524 + 4 * 6
 
 
 @pytest.mark.parametrize(("opacity", "reached"), [(0.3, 0.6), (0.2, 0.4), (2.0, 1.0)])

@@ -107,8 +107,10 @@ def test_what_is_not_seen_has_no_reach_and_no_gradient(backend, particle):
 
 
 @pytest.mark.parametrize("scale", [0.0, 1e-30, 1e-5, 5.0, (1.0, 1e-6, 1e-6), (1.0, 1.0, 0.0)])
-@pytest.mark.parametrize("opacity", [-5.0, 0.0, 40.0])
-@pytest.mark.parametrize("quaternion", [(1.0, 0, 0, 0), (0.0, 0, 0, 0), (1e-9, 3e8, -2e8, 1e8)])
+@pytest.mark.parametrize(
+    ("opacity", "quaternion"),
+    [(-5.0, (0.0, 0, 0, 0)), (0.0, (1.0, 0, 0, 0)), (40.0, (1e-9, 3e8, -2e8, 1e8))],
+)
 def test_extreme_particles_are_finite(backend, scale, opacity, quaternion):
     leaves = leaves_of(one((0.1, 0.1, 0.0), scale=scale, opacity=opacity, quaternion=quaternion))
     splats = seen(leaves)
@@ -191,8 +193,9 @@ def sorted_by(splats, threads):
     return [tiles.order[entries[a:b]].tolist() for a, b in zip(ends, ends[1:])], records, tiles.order
 
 
-@pytest.mark.parametrize("count", [0, 1, 15, 16, 17, 100])
-@pytest.mark.parametrize("widest", [0.5, 9.0, 200.0])
+@pytest.mark.parametrize(
+    ("count", "widest"), [(0, 9.0), (1, 9.0), (15, 0.5), (16, 200.0), (17, 9.0), (100, 0.5), (100, 200.0)]
+)
 def test_each_tile_looks_at_what_touches_it(count, widest):
     splats = splats_of(count, widest=widest)
     tiles, records, order = sorted_by(splats, 1)
@@ -209,16 +212,15 @@ def test_each_tile_looks_at_what_touches_it(count, widest):
     np.testing.assert_allclose(records, expected, rtol=1e-6)
 
 
-@pytest.mark.parametrize("count", [1, 17, 100])
-@pytest.mark.parametrize("threads", [2, 3, 40])
+@pytest.mark.parametrize(("count", "threads"), [(1, 2), (17, 3), (100, 40)])
 def test_threads_do_not_change_the_tiles(count, threads):
     alone, several = sorted_by(splats_of(count), 1), sorted_by(splats_of(count), threads)
     assert several[0] == alone[0]
     np.testing.assert_array_equal(several[1], alone[1])
 
 
-@pytest.mark.parametrize("bad", [float("nan"), float("inf"), -float("inf"), 1e30])
-@pytest.mark.parametrize("column", ["x", "y", "conic_a", "conic_b", "conic_c", "reach_x", "reach_y"])
+@pytest.mark.parametrize("bad", [float("nan"), float("inf"), 1e30])
+@pytest.mark.parametrize("column", ["x", "conic_a", "conic_b", "reach_y"])
 def test_numbers_that_mean_nothing_spoil_no_other_splat(bad, column):
     splats = splats_of(40)
     wanted, _, _ = sorted_by(np.delete(splats, 20, 0), 1)

@@ -82,8 +82,7 @@ def full(*shape):
     return torch.ones(shape, dtype=torch.bool)
 
 
-@pytest.mark.parametrize("density", [0.1, 0.3, 1.0])
-@pytest.mark.parametrize("shape", [(2, 3, 4), (9, 14, 6)])
+@pytest.mark.parametrize(("shape", "density"), [((2, 3, 4), 0.3), ((9, 14, 6), 0.1), ((9, 14, 6), 1.0)])
 def test_equals_the_slow_twin(backend, shape, density):
     generator, size = seeded(5), torch.tensor(shape, dtype=F64)
     cells = torch.rand(shape, generator=generator) < density
@@ -152,8 +151,9 @@ def traced(origins, directions, jitter, cells, index, raw, **changes):
     return march.trace(origins, directions, 0.2, 40.0, STEP, cells, jitter, **numbers)
 
 
-@pytest.mark.parametrize("strength", [0.0, 6.0, 1e6])
-@pytest.mark.parametrize("dtype", [torch.float32, F64])
+@pytest.mark.parametrize(
+    ("strength", "dtype"), [(0.0, F64), (6.0, F64), (6.0, torch.float32), (1e6, torch.float32)]
+)
 def test_trace_equals_the_operators_one_by_one(strength, dtype):
     scene = [t.to(dtype) if t.is_floating_point() else t for t in matter(strength)]
     found, (rays, distances, weights, through) = traced(*scene, threshold=-1.0), plainly(*scene)

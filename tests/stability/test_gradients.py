@@ -209,10 +209,8 @@ def test_gradients_equal_finite_differences(operator, numba, monkeypatch):
     if numba:
         pytest.importorskip("numba")
     monkeypatch.setattr(backend, "numba_installed", lambda: numba)
-    for seed in (0, 5113):
-        function, *inputs = CHECKS[operator](seed)
-        leaves = [x.detach().clone().requires_grad_() for x in inputs]
-        assert gradcheck(function, leaves, atol=1e-6), seed
+    function, *inputs = CHECKS[operator](0)
+    assert gradcheck(function, [x.detach().clone().requires_grad_() for x in inputs], atol=1e-6)
 
 
 def test_every_operator_is_checked_or_has_no_gradient():

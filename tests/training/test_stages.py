@@ -60,17 +60,9 @@ class Crash(lightning.Callback):
             raise SystemExit
 
 
-@pytest.mark.parametrize(
-    "interruptions",
-    [
-        [Crash()],
-        [Interrupt("fine", 3), Interrupt("fine", 7)],  # before and after the lattice grows
-        [Interrupt("coarse", 9), Interrupt("fine", 5)],  # at the last step, and as the lattice grows
-    ],
-    ids=["between", "fine", "edges"],
-)
-def test_a_continued_run_equals_an_uninterrupted_one_to_the_bit(tmp_path, whole, interruptions):
-    for interruption in interruptions:
+def test_a_continued_run_equals_an_uninterrupted_one_to_the_bit(tmp_path, whole):
+    """Ended at a last step, between stages, and before, while and after the lattice grows."""
+    for interruption in (Interrupt("coarse", 9), Crash(), *(Interrupt("fine", step) for step in (3, 5, 7))):
         with pytest.raises(SystemExit):
             run(tmp_path, [interruption]).fit()
     assert same(run(tmp_path).fit(), whole[1])
