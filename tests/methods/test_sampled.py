@@ -446,9 +446,8 @@ def test_pictures_of_a_jittered_method_are_drawn_alike():
     assert not first.equal(other)
 
 
-@pytest.mark.parametrize(
-    "kind", ["tnerf", *(pytest.param(k, marks=pytest.mark.slow) for k in KINDS if k != "tnerf")]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", KINDS)
 def test_it_learns_what_moves(kind, tmp_path):
     psnr, ceiling = learned(kind, tmp_path)[1], static_ceiling()
     assert ceiling - 3 < psnr <= ceiling if kind == "nerf" else psnr > ceiling + 3

@@ -95,7 +95,6 @@ def test_what_is_no_plain_config_is_refused_in_one_line(text, said, trust):
     "words",
     [
         ["experiment=demo_hypernerf"],
-        ["experiment=lego_complete", "data.scene=x", "preset=faithful", "trainer=gpu", "logger=none"],
         ["experiment=video_with_poses", "data.scene=x", "model=forward", "model/motion=dct_features"],
     ],
 )
@@ -131,10 +130,9 @@ def test_a_class_of_ours_is_refused_where_it_does_not_belong():
 @pytest.mark.parametrize(
     ("key", "value"),
     [
-        *(("checkpoint_seconds", value) for value in ("nan", "-1", "[nan]", "inf", "often")),
-        *(("evaluate", "maybe"), ("seed", str(2**32)), ("seed", "-1"), ("seed", "1.5"), ("data.seed", "-1")),
-        *(("lpips_weights", "1e400"), ("lpips_weights", "[a,3]"), ("callbacks.progress", "text")),
-        *(("data.scene", "' '"), ("data.scene", "../../x"), ("data.scene", "/x")),
+        *(("checkpoint_seconds", "[nan]"), ("checkpoint_seconds", "inf"), ("evaluate", "maybe")),
+        *(("seed", str(2**32)), ("seed", "1.5"), ("lpips_weights", "[a,3]"), ("callbacks.progress", "text")),
+        *(("data.scene", "' '"), ("data.scene", "../../x"), ("data.seed", "-1")),
     ],
 )
 def test_a_value_that_would_be_noticed_late_is_refused_at_once(key, value):
