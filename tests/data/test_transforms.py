@@ -93,6 +93,8 @@ def test_times_that_a_file_does_not_tell_are_in_the_names(names, times):
     assert found == pytest.approx(times) or names[0] == "a/1"
     assert told.startswith("t.json: no time in the frames: ")
     assert times_of(names, times, "t.json") == (times, None)
+    same, line = times_of(names, [7] * len(names), "t.json")
+    assert (same, line) == ([0] * len(names), "t.json: all times lie from 7 to 7: taken as one moment")
     assert (
         "all times lie from 0.1 to 0.102" in times_of(names, [0.1, *[0.102] * (len(names) - 1)], "t.json")[1]
     )

@@ -58,18 +58,14 @@ def remarks(scene: Scene) -> Iterator[str]:
 
 def _aimed(scene: Scene, aim: Tensor) -> Iterator[str]:
     """Compare near, far and the box with the point (3,) that the cameras look at, in the file's units."""
-    scale = scene.protocol.get("normalisation", {"scale": 1.0})["scale"]
     point = f"the point that all cameras look at, {_in_file(scene, aim.tolist())},"
     cameras = [frame.camera for frame in scene.train]
     away = torch.stack([(aim - camera.center).norm() for camera in cameras])
     near, far = (torch.tensor([getattr(camera, end) for camera in cameras]) for end in ("near", "far"))
     for key, bound, beyond in (("near", near, away < near), ("far", far, away > far)):
         if float(beyond.double().mean()) > _FEW:
-            middle = [float(values.median()) / scale for values in (away, bound)]
-            yield (
-                f"{point} is {middle[0]:.4g} away, with {key} at {middle[1]:.4g}; set data.{key}, or mend "
-                "the file's"
-            )
+            distance, at = (_length(scene, float(values.median())) for values in (away, bound))
+            yield f"{point} is {distance} away, with {key} at {at}; set data.{key}, or mend the file's"
     if not scene.box.scaled(2).holds(aim):
         yield f"{point} lies far outside the box {_bounds(scene)}; set data.box=null"
 
@@ -79,11 +75,16 @@ def _bounds(scene: Scene) -> str:
     return f"{_in_file(scene, scene.box.low)} to {_in_file(scene, scene.box.high)}"
 
 
+def _length(scene: Scene, length: float) -> str:
+    """Write a length of the scene in the file's units."""
+    return f"{length / scene.protocol.get('normalisation', {'scale': 1.0})['scale']:.4g}"
+
+
 def _in_file(scene: Scene, place: Sequence[float]) -> str:
     """Write a place (3,) of the scene in the file's units."""
     file = scene.protocol.get("normalisation", {"center": [0, 0, 0], "scale": 1.0})
     values = (value / file["scale"] + middle for value, middle in zip(place, file["center"]))
-    return f"({', '.join(f'{value:.4g}' for value in values)})"
+    return f"({', '.join(f'{round(value, 9) + 0.0:.4g}' for value in values)})"
 
 
 def _silhouettes(scene: Scene) -> Iterator[str]:
@@ -142,12 +143,12 @@ def check_seen(scene: Scene) -> None:
     if blind_frames(scene) < len(scene.train):
         return
     focus = focus_point([frame.camera for frame in scene.train]).tolist()
-    near, far = scene.train[0].camera.near, scene.train[0].camera.far
+    near, far = (_length(scene, getattr(scene.train[0].camera, end)) for end in ("near", "far"))
     raise mismatch(
         "data.box, data.near, data.far",
         "a box that cameras see between near and far",
-        f"{_bounds(scene)}, near {near:g}, far {far:g}; cameras look at {_in_file(scene, focus)}",
-        "set data.box=null data.near=null data.far=null, where the format has these keys",
+        f"{_bounds(scene)}, near {near}, far {far}; cameras look at {_in_file(scene, focus)}",
+        "set data.box=null data.near=null data.far=null, or mend what they are of, as points in other units",
     )
 
 

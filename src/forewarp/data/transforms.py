@@ -32,7 +32,7 @@ _SAME_FOCAL = 0.02  # share by which two focal lengths of one camera may differ
 _OUTSIDE = 0.9  # share of a side beyond which a principal point is another image's
 _LEAST_CAMERAS = 4  # of which can be told whether they look at something in common
 _ALL = 0.9  # share of cameras before which a common point must lie
-_MOST_TIME = 1e12
+_MOST_TIME = 1e20
 _LEAST_SPAN = 0.05  # of all times: less is hardly what was meant
 _MEET, _MISS = 0.15, 0.5  # miss of the axes in shares of the distance: they meet in a point, they do not
 _CAMERA_WORDS = re.compile(r"(cam|camera|view|sensor|c|v)[_-]?$", re.IGNORECASE)
@@ -329,10 +329,10 @@ def times_of(
     given = [time is not None for time in times]
     if all(given):
         first, last = min(times), max(times)
-        span = f"{where}: all times lie from {first:g} to {last:g}"
+        span = f"{where}: all times lie from {first:.10g} to {last:.10g}"
         if first < 0 or last > 1:
-            length = max(last - first, 1e-12)
-            return [(time - first) / length for time in times], f"{span}: taken as 0 to 1"
+            length, taken = last - first, "taken as 0 to 1" if last > first else "taken as one moment"
+            return [(time - first) / (length or 1) for time in times], f"{span}: {taken}"
         line = f"{span}, where 0 to 1 is the whole sequence"
         return list(times), line if len(times) > 1 and last - first < _LEAST_SPAN else None
     if any(given):
