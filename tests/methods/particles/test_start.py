@@ -21,7 +21,9 @@ from forewarp.methods.particles.start import (
     widths,
 )
 from forewarp.ops.backend import numba_installed
+from forewarp.scene.camera import Camera, Lens
 from forewarp.scene.cloud import Cloud, Handover
+from forewarp.scene.frame import Frame
 from tests.contract.scenes import DATASETS, RADIUS, ball_center, data_of
 from tests.support.kernels import watch
 from tests.support.particles import EVERY, look, module_with, small_data
@@ -98,6 +100,21 @@ def test_an_image_of_a_sweep_fills_only_its_holes(scene_of):
         fills = _in_holes(there, rays.origins + depth * rays.directions, camera, 5)
         assert torch.equal(fills, column >= 12)
     assert bool(_in_holes(torch.zeros(0, 3), there, camera, 5).all())
+
+
+def test_the_lens_of_an_image_that_is_swept_is_undone():
+    """The colour of a pixel is its place; without the lens it is where the lens shows its ray."""
+    pose = torch.eye(4, dtype=torch.float64)
+    bent = Camera(96, 64, 80.0, 80.0, 48.0, 32.0, pose, 0.1, 9.0, lens=Lens((0.15, 0.0, 0.0)))
+    rows, columns = torch.meshgrid(torch.arange(64), torch.arange(96), indexing="ij")
+    image = torch.stack([rows, columns, 0 * rows, 255 + 0 * rows], -1).byte()
+    rgb, valid, straight = start._small([Frame("a", 0.0, bent, lambda: image)], 64, 0)
+    assert straight.lens is None
+    assert (valid == 1).all()
+    pixel, _ = bent.project(straight.rays(dtype=torch.float64).directions)
+    shown = pixel.reshape(64, 96, 2)[8:-8, 8:-8] - 0.5
+    found = 255 * rgb[8:-8, 8:-8, [1, 0]]
+    assert (found - shown).abs().max() < 0.1
 
 
 def test_what_a_stage_left_comes_first_and_random_points_last(scene_of):

@@ -6,8 +6,10 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
+from dataclasses import replace
+from functools import cache, lru_cache, partial
 from tempfile import TemporaryFile
 
 import torch
@@ -30,9 +32,9 @@ from forewarp.ops.gaussians import (
 from forewarp.ops.grid import dilate
 from forewarp.ops.nodes import carry_nodes, pull_nodes, skin_weights, spread_nodes
 from forewarp.scene.box import Box, Lattice
-from forewarp.scene.camera import Camera
+from forewarp.scene.camera import Camera, Lens
 from forewarp.scene.cloud import Cloud
-from forewarp.scene.frame import Scene, spread, visual_hull
+from forewarp.scene.frame import Frame, Scene, spread, visual_hull
 
 _FRAMES = 12  # whose silhouettes carve the hull
 _DRIFT = 0.2  # share of an image's width by which a silhouette is taken to move in all the time there is
@@ -180,44 +182,72 @@ def swept(scene: Scene, frames: list[int], count: int) -> Cloud | None:
     still = scene.still.float() if scene.still is not None else torch.zeros(0, 3)
     cameras, images = zip(*((scene.train[i].camera, scene.train[i].load()) for i in chosen))
     points, colors, sizes = [still], [seen_colors(still, cameras, images)], []
+    small = cache(partial(_small, scene.train, side))
     low, high = torch.tensor(scene.box.low), torch.tensor(scene.box.high)
     for i in chosen:
-        new, color, size = _sweep(scene, i, side)
-        fills = _in_holes(torch.cat(points), new, scene.train[i].camera, side)
-        fills &= ((new >= low) & (new <= high)).all(-1)
+        new, color, size = _sweep(scene, i, side, small, torch.cat(points))
+        fills = ((new >= low) & (new <= high)).all(-1)
         points.append(new[fills])
         colors.append(color[fills])
         sizes.append(size)
     points, colors = torch.cat(points), torch.cat(colors)
     if not len(points):
         return None
-    return Cloud(points, colors, torch.full((len(points),), 0.5), float(torch.stack(sizes).median()))
+    return Cloud(points, colors, torch.full((len(points),), 0.5), float(torch.stack(sizes).nanmedian()))
 
 
-def _small(scene: Scene, i: int, side: int) -> tuple[Tensor, Camera]:
-    """Return an image (h, w, 3) whose longer side is about four times the lattice's, and its camera."""
-    camera, rgba = scene.train[i].camera, scene.train[i].load()
+_Small = Callable[[int], tuple[Tensor, Tensor, Camera]]  # an image's number -> see ``_small``
+
+
+def _small(frames: Sequence[Frame], side: int, i: int) -> tuple[Tensor, Tensor, Camera]:
+    """Return an image (h, w, 3) whose longer side is about four times the lattice's, the share of each of its
+    pixels that is learned from (h, w), and its camera, whose lens is undone: it would be, for every plane.
+    """
+    frame, camera = frames[i], frames[i].camera
     scale = min(1.0, 4 * side / max(camera.width, camera.height))
     size = max(1, round(camera.height * scale)), max(1, round(camera.width * scale))
-    rgb = rgba[..., :3].permute(2, 0, 1)[None].float() / 255
-    rgb = torch.nn.functional.interpolate(rgb, size, mode="area")[0].permute(1, 2, 0)
-    return rgb, camera.resized(size[1], size[0])
+    valid = None if frame.load_valid is None else frame.load_valid()[..., None].float()
+    planes = [frame.load()[..., :3].float() / 255] + ([] if valid is None else [valid])
+    planes = torch.cat([plane.permute(2, 0, 1)[None] for plane in planes], 1)
+    planes = torch.nn.functional.interpolate(planes, size, mode="area")
+    camera = camera.resized(size[1], size[0])
+    if camera.lens is not None:
+        inner = camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy, camera.skew
+        places = _bent_pixels(*inner, camera.lens)
+        planes = torch.nn.functional.grid_sample(planes, places, padding_mode="border", align_corners=False)
+        camera = replace(camera, lens=None)
+    rgb = planes[0, :3].permute(1, 2, 0).contiguous()
+    return rgb, torch.ones(size) if valid is None else planes[0, 3], camera
 
 
-def _sweep(scene: Scene, i: int, side: int) -> tuple[Tensor, Tensor, Tensor]:
+@lru_cache(maxsize=8)
+def _bent_pixels(width: int, height: int, *inner: float | Lens) -> Tensor:
+    """Return where a lens puts the pixels of an image without it (1, H, W, 2), in [-1, 1]; once for all
+    images of a camera, as looking for where a lens folds takes a tenth of a second.
+    """
+    fx, fy, cx, cy, skew, lens = inner
+    camera = Camera(width, height, fx, fy, cx, cy, torch.eye(4, dtype=torch.float64), 0.0, 1.0, skew, lens)
+    pixel, _ = camera.project(replace(camera, lens=None).rays(dtype=torch.float64).directions)
+    return (2 * pixel / torch.tensor([width, height]) - 1).float().reshape(1, height, width, 2)
+
+
+def _sweep(scene: Scene, i: int, side: int, small: _Small, before: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Return points (P, 3) of an image's lattice at their best depths, their colours, and their size ().
 
-    None is at a pixel that is not valid.
+    None is at a pixel that is not valid, or in a cell of the lattice with a point of ``before`` (N, 3).
     """
-    rgb, camera = _small(scene, i, side)
+    rgb, valid, camera = small(i)
     step = max(1, round(max(camera.width, camera.height) / side))
     rows, columns = torch.meshgrid(
         torch.arange(min(step // 2, camera.height - 1), camera.height, step),
         torch.arange(min(step // 2, camera.width - 1), camera.width, step),
         indexing="ij",
     )
-    rays = camera.rays((rows * camera.width + columns).flatten())
-    color = rgb[rows, columns].reshape(-1, 3)
+    rows, columns = rows.flatten(), columns.flatten()
+    rays = camera.rays(rows * camera.width + columns)
+    swept = _in_holes(before, rays.origins + rays.directions, camera, side)
+    swept &= valid[rows, columns] == 1  # what is not learned from is no start either
+    rays, color = rays[swept], rgb[rows[swept], columns[swept]]
     time = scene.train[i].time
     neighbours = sorted(
         (j for j in range(len(scene.train)) if j != i),
@@ -226,16 +256,10 @@ def _sweep(scene: Scene, i: int, side: int) -> tuple[Tensor, Tensor, Tensor]:
     near = _nearest_plane(camera, [scene.train[j].camera for j in neighbours])
     depths = 1 / torch.linspace(1 / near, 1 / camera.far, _DEPTHS)
     points = rays.origins[:, None] + depths[:, None] * rays.directions[:, None]  # (P, D, 3)
-    costs = torch.stack([_difference(scene, j, side, points, color) for j in neighbours])
+    costs = torch.stack([_difference(points, color, *small(j)) for j in neighbours])
     best_half = costs.sort(0).values[: max(1, len(neighbours) // 2)].mean(0)
     depth = depths[best_half.argmin(-1)]
     points, size = rays.origins + depth[:, None] * rays.directions, depth.median() * step / camera.fx
-    if scene.train[i].load_valid is not None:  # what is not learned from is no start either
-        valid = scene.train[i].load_valid()[None, None].float()
-        valid = torch.nn.functional.interpolate(valid, rgb.shape[:2], mode="area")[
-            0, 0, rows, columns
-        ].flatten()
-        points, color = points[valid == 1], color[valid == 1]
     return points, color, size
 
 
@@ -249,9 +273,8 @@ def _nearest_plane(camera: Camera, neighbours: Sequence[Camera]) -> float:
     return min(max(camera.near, half_an_image, _NEAREST_PLANE * camera.far), 0.5 * camera.far)
 
 
-def _difference(scene: Scene, j: int, side: int, points: Tensor, color: Tensor) -> Tensor:
+def _difference(points: Tensor, color: Tensor, rgb: Tensor, valid: Tensor, camera: Camera) -> Tensor:
     """Return how unlike another image is (P, D) at points (P, D, 3); 1 where it does not show them."""
-    rgb, camera = _small(scene, j, side)
     inside, row, column = _pixels(camera, points)
     return torch.where(inside, (rgb[row, column] - color[:, None]).abs().mean(-1), 1.0)
 
