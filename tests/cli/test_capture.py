@@ -56,12 +56,15 @@ FILM = "video=a.mp4"
         ([FILM, "lens=FOV"], "lens: expected one of SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL"),
         ([FILM, "matching=x"], "matching: expected one of auto, sequential, exhaustive, but got 'x'"),
         ([FILM, "out=."], "out: expected a folder to be made, but got ., which you are in"),
+        (["images=empty", "out=empty/new"], "out: expected a folder outside images=empty, whose files it"),
+        ([FILM, "masks=empty", "out=empty/new"], "out: expected a folder outside masks=empty, whose files"),
+        (["images=full/empty", "out=full"], "holds no inputs, but got full with images=full/empty; set out="),
         ([FILM, "out=full"], "full: expected no folder, an empty one, or one written before"),
     ],
 )
 def test_mistakes_end_before_anything_is_loaded(in_tmp, words, says):
-    for folder in ("empty", "full"):
-        (in_tmp / folder).mkdir()
+    for folder in ("empty", "full/empty"):
+        (in_tmp / folder).mkdir(parents=True)
     for file in ("a.mp4", "full/theirs"):
         (in_tmp / file).touch()
     config = OmegaConf.merge(OmegaConf.load(CONF / "capture.yaml"), OmegaConf.from_dotlist(words))

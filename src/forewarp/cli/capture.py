@@ -101,6 +101,16 @@ def check(config) -> tuple[dict, object]:
     out = Path(config.out or Path("captures") / (video or images).resolve().stem)
     if Path.cwd().is_relative_to(out.resolve()):
         raise ValueError(f"out: expected a folder to be made, but got {out}, which you are in; name another")
+    for key, path in source.items():
+        place, ours = out.resolve(), path and path.resolve()
+        if ours and ours.is_relative_to(place):
+            raise ValueError(
+                f"out: expected a folder that holds no inputs, but got {out} with {key}={path}; set out=..."
+            )
+        if ours and key in ("images", "masks") and place.is_relative_to(ours):
+            raise ValueError(
+                f"out: expected a folder outside {key}={path}, whose files it reads, but got {out}"
+            )
     if (out / MARKERS["posed_video"]).exists() and not config.overwrite:
         raise ValueError(f"{out}: expected a new folder, but got a scene; set overwrite=true or out=...")
     check_replaceable(out, "capture.json")
