@@ -1,9 +1,11 @@
 from contextlib import nullcontext
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 from scipy.spatial.transform import Rotation
 
 pytest.importorskip("pycolmap", reason="no pycolmap; make install adds it")
@@ -12,7 +14,7 @@ import pycolmap
 
 from forewarp.capture import pipeline, poses
 from forewarp.capture.poses import Search, adjust, read_model
-from tests.support.captures import cameras_on_arc, write_model
+from tests.support.captures import WALKS, cameras_of, cameras_on_arc, pictures_of, write_model
 
 POINTS = np.random.default_rng(0).uniform(-1, 1, (40, 3))
 LENS = (0.05, -0.02, 0.001, -0.002)
@@ -139,7 +141,7 @@ def test_the_error_of_all_points_is_kept_for_the_next_call(model, tmp_path, monk
         monkeypatch.setattr(poses, name, lambda *given, result=result: result)
     for name in ("refuse_matches", "refuse_poses"):
         monkeypatch.setattr(pipeline, name, lambda *given: None)
-    frames, quiet = SimpleNamespace(folder=None, masks=None), lambda done, total: None
+    frames, quiet = SimpleNamespace(folder=None, masks=None, times=range(6)), lambda done, total: None
     first = pipeline.find_poses(tmp_path, frames, Search(threads=1), lambda title: nullcontext(quiet))
     again = pipeline.find_poses(tmp_path, frames, Search(threads=1), None)
     assert first.error == again.error == error
@@ -195,3 +197,48 @@ def test_what_is_burnt_in_is_found_and_left_out(tmp_path):
 def test_the_world_is_not_taken_for_burnt_in(tmp_path, turn, far):
     """Nor are mountains behind a camera that does not turn, which stand still too."""
     assert not poses.burnt_in(matched(tmp_path, turn, far)).any()
+
+
+def test_a_first_look_is_refused_before_the_rest(tmp_path, monkeypatch):
+    """Of 50 images every fourth is looked at; then all, unless matches are refused."""
+    looks = []
+    monkeypatch.setattr(poses, "find_features", lambda *given: looks.append(given[-1]))
+    monkeypatch.setattr(poses, "match", lambda *given: looks.append(given[-1]))
+    monkeypatch.setattr(pipeline, "refuse_matches", lambda database, images, force: 1 / force)
+    frames = SimpleNamespace(folder=None, masks=None, times=range(50))
+    for force, error in ((False, ZeroDivisionError), (True, TypeError)):  # there is no database
+        with pytest.raises(error):
+            pipeline.find_poses(tmp_path, frames, Search(), lambda title: nullcontext(None), force)
+    assert looks == [4, 4, 4, 4, None, None]
+
+
+def test_images_keep_their_numbers_whatever_is_looked_at_first(tmp_path):
+    """Also a look at a few is gone on with; what is not looked at yet has no features to count."""
+    (tmp_path / "images").mkdir()
+    pixels = np.random.default_rng(0).integers(0, 256, (12, 16, 3), np.uint8).repeat(8, 0).repeat(8, 1)
+    for number in range(6):
+        Image.fromarray(np.roll(pixels, 5 * number, 1)).save(tmp_path / "images" / f"{number}.png")
+    search, quiet = Search(threads=1, features=200), lambda done, total: None
+    for every, looked_at, pairs in ((2, {1, 3, 5}, 3), (None, {1, 2, 3, 4, 5, 6}, 15)):
+        database = poses.find_features(tmp_path, tmp_path / "images", None, search, quiet, every)
+        poses.match(database, search, quiet, every)
+        with pycolmap.Database.open(database) as base:
+            assert [image.name for image in base.read_all_images()] == [f"{n}.png" for n in range(6)]
+            assert {n for n in range(1, 7) if base.exists_keypoints(n)} == looked_at
+            assert base.num_cameras() == 1
+            assert len(base.read_two_view_geometries()[0]) == pairs
+        assert poses.evidence_of(database).features > 50
+
+
+@pytest.mark.slow
+def test_an_orbit_with_a_long_lens_is_no_turn(tmp_path):
+    walk = replace(WALKS["room"], radius=10.0, angle=17.0)
+    times = np.linspace(0, 1, 10)
+    (tmp_path / "images").mkdir()
+    cameras = cameras_of(walk, times, 3.0, (320, 240))
+    for number, pixels in enumerate(pictures_of(walk, times, cameras, samples=1, workers=1)):
+        Image.fromarray(pixels).save(tmp_path / "images" / f"{number:02d}.png")
+    search, quiet = Search(threads=1), lambda done, total: None
+    database = poses.find_features(tmp_path, tmp_path / "images", None, search, quiet)
+    poses.match(database, search, quiet)
+    assert poses.evidence_of(database).unrotated > 1.3 * poses.TURNED

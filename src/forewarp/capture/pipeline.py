@@ -85,10 +85,13 @@ def find_poses(work: Path, images: Frames, search: Search, step: Step, force: bo
     if best.is_dir():
         found = Reconstruction.of(pycolmap.Reconstruction(best))
         return dataclasses.replace(found, **read_json(best / _ERROR))
-    with step("features") as progress:
-        database = poses.find_features(work, images.folder, images.masks, search, progress)
-    with step("matches") as progress:
-        poses.match(database, search, progress)
+    for look, every in (("first ", poses.first_look(len(images.times))), ("", None)):
+        with step(f"{look}features") as progress:
+            database = poses.find_features(work, images.folder, images.masks, search, progress, every)
+        with step(f"{look}matches") as progress:
+            poses.match(database, search, progress, every)
+        if every is not None:  # before the work that a refusal would waste
+            refuse_matches(database, images, force)
     if (burnt := _burnt_in(work)) is None and (burnt := poses.burnt_in(database)).any():
         write_image(work / _BURNT, np.where(burnt, 0, 255).astype(np.uint8))
     if burnt.any():

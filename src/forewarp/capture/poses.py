@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -20,6 +21,7 @@ pycolmap.logging.minloglevel = pycolmap.logging.FATAL.value  # print nothing but
 _OVERLAP = 6  # of sequential matching: the next six images, and those at 1, 2, 4 ... 512
 _FEW = 40  # images of which every pair is matched
 _FEATURE_SIDE = 1600  # pixels of the longer side in which features are looked for
+_LOOK = 24  # images, at most, that are looked at before all
 _BATCH, _PAIR_BATCH = 8, 48  # images and pairs between two updates of the progress
 # Of the last adjustment: a point is sure from so many views and up to so many pixels of error; a camera keeps
 # its other points if it has fewer sure ones; an error of so many pixels hardly counts.
@@ -196,8 +198,15 @@ class Search:
     threads: int | None = None
 
 
-def find_features(folder: Path, images: Path, masks: Path | None, search: Search, progress: Progress) -> Path:
-    """Find the features of all images that have none yet; return the database.
+def find_features(
+    folder: Path,
+    images: Path,
+    masks: Path | None,
+    search: Search,
+    progress: Progress,
+    every: int | None = None,
+) -> Path:
+    """Find the features of all images, or of each ``every``-th, that have none yet; return the database.
 
     Args:
         folder: of the database.
@@ -205,6 +214,7 @@ def find_features(folder: Path, images: Path, masks: Path | None, search: Search
         masks: folder of ``<image's name>.png``; features on black are left out.
         search: how to search.
         progress: called with images done and all.
+        every: of ``first_look``; None: all. The numbers of images in the database are the same.
     """
     database, names = folder / "database.db", sorted(path.name for path in images.iterdir())
     reader = pycolmap.ImageReaderOptions(camera_model=search.lens)
@@ -215,33 +225,49 @@ def find_features(folder: Path, images: Path, masks: Path | None, search: Search
     )
     options.sift.max_num_features = search.features
     with pycolmap.Database.open(database) as base:
-        done = {image.name for image in base.read_all_images() if base.exists_keypoints(image.image_id)}
-    left = [name for name in names if name not in done]
-    progress(len(done), len(names))
+        numbers = {image.name: image.image_id for image in base.read_all_images()}
+        done = {name for name, number in numbers.items() if base.exists_keypoints(number)}
+    if not numbers:
+        pycolmap.import_images(
+            database,
+            images,
+            camera_mode=pycolmap.CameraMode.SINGLE,
+            image_names=names,
+            options=reader,
+        )
+    chosen = names[::every]
+    left = [name for name in chosen if name not in done]
+    progress(len(chosen) - len(left), len(chosen))
     for start in range(0, len(left), _BATCH):
-        with pycolmap.Database.open(database) as base:
-            for camera in base.read_all_cameras():  # one: else later images would get another
-                reader.existing_camera_id = camera.camera_id
-        batch = left[start : start + _BATCH]
         pycolmap.extract_features(
             database,
             images,
-            image_names=batch,
+            image_names=left[start : start + _BATCH],
             camera_mode=pycolmap.CameraMode.SINGLE,
             reader_options=reader,
             extraction_options=options,
             device=pycolmap.Device.cpu,
         )
-        done.update(batch)
-        progress(len(done), len(names))
+        progress(len(chosen) - max(0, len(left) - start - _BATCH), len(chosen))
     return database
 
 
-def match(database: Path, search: Search, progress: Progress) -> None:
-    """Match and verify the pairs of images that are not matched yet."""
+def first_look(count: int) -> int:
+    """Choose every how many of ``count`` images are looked at first: about 24, spread over all.
+
+    >>> first_look(24), first_look(120)
+    (1, 8)
+    """
+    return 2 ** math.ceil(math.log2(max(1.0, count / _LOOK)))
+
+
+def match(database: Path, search: Search, progress: Progress, every: int | None = None) -> None:
+    """Match and verify the pairs of images that are not matched yet, or a few of each ``every``-th image."""
     with pycolmap.Database.open(database) as base:
         images = sorted((image.name, image.image_id) for image in base.read_all_images())
         pairs = pairs_of(len(images), search.matching)
+        if every is not None:  # 1, 2, 4 ... of those further
+            pairs = [(i, j) for i, j in pairs if i % every == j % every == 0 and ((j - i) & (j - i - 1)) == 0]
         left = [
             f"{images[i][0]} {images[j][0]}\n"
             for i, j in pairs
@@ -425,7 +451,7 @@ def adjust(model: pycolmap.Reconstruction, search: Search, progress: Progress) -
 MIN_FEATURES = 60  # of an image, in the median
 STILL = 0.01  # share of an image's longer side: a camera that stands shifts less
 BLURRED = 2.5  # pixels of an image 640 wide, as ``frames.edge_width`` has them
-TURNED = 0.015  # share of shift that no rotation explains: turned by hand 0.010, moved with a long lens 0.028
+TURNED = 0.017  # share of shift that no rotation explains: turned by hand 0.011, moved with a long lens 0.028
 MIN_MODEL, MIN_REGISTERED = 3, 0.5  # images; share of them, where poses are searched for
 MAX_DEGREES = 130.0
 MAX_ERROR = 2.5  # pixels
@@ -541,7 +567,8 @@ def evidence_of(database: Path) -> Evidence:
     """
     shifts, shares = [], []
     with pycolmap.Database.open(database) as base:
-        numbers = [image.image_id for image in base.read_all_images()]
+        every = [image.image_id for image in base.read_all_images()]
+        numbers = [number for number in every if base.exists_keypoints(number)]
         camera = base.read_all_cameras()[0]
         side, middle = max(camera.width, camera.height), np.array([camera.width, camera.height]) / 2
         features = float(np.median([base.num_keypoints_for_image(number) for number in numbers]))
