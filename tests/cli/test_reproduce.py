@@ -122,10 +122,6 @@ def test_make_hands_over_what_was_typed():
 @pytest.mark.parametrize(
     ("line", "page"),
     [
-        (
-            "ablations JOBS=1 SEEDS=1 MORE='ablation=full,no_tv scene=counterpart_dnerf'",
-            "results/ablation.md",
-        ),
         ("accuracy-time CHANGES=stage.fine.density=45", "accuracy_time/results/accuracy-time.md"),
         ("bench-gpu DEVICE=cpu", "bench-gpu/results/price-list.md"),
         ("effects MODEL=particles MORE=scene=specimen_still", "effects/results/effects-particles.md"),
@@ -136,3 +132,23 @@ def test_the_small_form_writes_the_page(line, page, tmp_path):
     done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True)
     assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-2000:]
     assert (tmp_path / "runs" / "small" / page).is_file()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("line", "page"),
+    [
+        ("ablations SEEDS=1 MORE=ablation=full,no_tv", "results/ablation.md"),
+        ("tables SEEDS=1 METHODS=nerf", "paper/results/paper.md"),
+    ],
+)
+def test_the_small_form_of_one_sweep_writes_the_page(line, page, ok, in_tmp, monkeypatch):
+    """In this process, as all the sweeps of these take minutes."""
+    monkeypatch.setattr(reproduce, "LANES", ("methods:dnerf ablation_losses:dnerf", ""))
+    kind, *typed = shlex.split(line)
+    job = plan_of(kind, Keys.typed([*typed, "SMALL=1"]))
+    for sweep in (sweep for lane in job.lanes for sweep in lane):
+        ok("train", "--multirun", *sweep)
+    for command in job.then:
+        ok(*command)
+    assert (in_tmp / "runs" / "small" / page).is_file()
