@@ -67,9 +67,9 @@ def solid(opacity, side=4, **options):
 
 
 def test_published_count_of_four_cameras():
+    start = Start(rig(), "fine", {}, blank=True)
     with torch.device("meta"):
-        made = NeuralVolumes(Start(rig(), "fine", {}, blank=True))
-    assert parameter_count(made) == 114_807_524 + 4 * 6
+        assert parameter_count(NeuralVolumes(start)) == 114_807_524 + 4 * 6
 
 
 @pytest.mark.parametrize(("opacity", "reached"), [(0.3, 0.6), (0.2, 0.4), (2.0, 1.0)])
