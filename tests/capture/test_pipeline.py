@@ -1,9 +1,14 @@
+from contextlib import nullcontext
+
 import pytest
 from filelock import FileLock
 
 pytest.importorskip("pycolmap", reason="no pycolmap; make install adds it")
 
-from forewarp.capture.pipeline import work_folder
+from forewarp.capture import pipeline
+from forewarp.capture.frames import Frames, Source
+from forewarp.capture.pipeline import capture, work_folder
+from forewarp.capture.poses import Search, TooFewRegistered
 
 ABOUT = {"video": "a.mp4", "frames": 12}
 
@@ -57,3 +62,26 @@ def test_two_at_once_are_refused(tmp_path):
         with pytest.raises(ValueError, match="expected one capture at a time"):
             work(tmp_path / "hand")
         assert folder.is_dir()
+
+
+def test_a_film_whose_poses_fail_is_tried_with_more_frames(tmp_path, monkeypatch):
+    (tmp_path / "a.mp4").touch()
+    tried = []
+
+    def take(work, source, step, *, count, size, threads, why="none"):
+        names = [f"{i:03d}" for i in range(count or 200)]
+        return Frames(work, None, dict.fromkeys(names, 0.0), range(len(names)), 600, 2.0, {}, {}, why=why)
+
+    def find_poses(work, images, *_):
+        tried.append((len(images.times), images.why))
+        raise TooFewRegistered(f"poses: expected most, but got few of {len(images.times)}")
+
+    monkeypatch.setattr(pipeline, "take", take)
+    monkeypatch.setattr(pipeline, "find_poses", find_poses)
+    step = lambda title: nullcontext(lambda done, total: None)  # noqa: E731
+    for frames, expected in ((None, [200, 400]), (50, [50])):
+        tried.clear()
+        with pytest.raises(TooFewRegistered, match=f"few of {expected[-1]}"):
+            capture(Source(video=tmp_path / "a.mp4"), tmp_path / "out", Search(), step, frames=frames)
+        assert [count for count, _ in tried] == expected
+    assert tried[-1] == (50, "none")

@@ -96,7 +96,14 @@ class Frames:
 
 
 def take(
-    work: Path, source: Source, step: Step, *, count: int | None, size: int | None, threads: int | None = None
+    work: Path,
+    source: Source,
+    step: Step,
+    *,
+    count: int | None,
+    size: int | None,
+    threads: int | None = None,
+    why: str = "frames= says so",
 ) -> Frames:
     """Take the images out of a video or a folder, unless an earlier call has done so.
 
@@ -107,6 +114,7 @@ def take(
         count: of frames to choose from a video; None: see ``frames_for``. Images of a folder are all taken.
         size: most pixels of the longer side; None: as they are.
         threads: of ffmpeg; None: as many as it likes.
+        why: so many frames, where ``count`` is given.
 
     Raises:
         ValueError: where they cannot be read or are too few.
@@ -118,6 +126,7 @@ def take(
             shutil.rmtree(left, ignore_errors=True)
         if source.video is not None:
             done = _from_video(folder, source.video, count, size, step, threads)
+            done["why"] = done["why"] or why
         else:
             done = _from_folder(folder, source, size, step)
         if source.masks is not None:
@@ -136,7 +145,7 @@ def _from_video(
     if len(stamps) < _MIN_IMAGES:
         got = f"{len(stamps)} frames"
         raise ValueError(f"{video}: expected a video of many frames, but got {got}; film longer")
-    count, why = frames_for(speeds) if count is None else (count, "frames= says so")
+    count, why = frames_for(speeds) if count is None else (count, None)
     chosen, times = sharpest(stamps, sharpnesses, count), {}
     transfer = hdr_of(video)
     mapped = f" ({_HDR[transfer]}, tone-mapped to SDR)" if transfer else ""

@@ -47,7 +47,8 @@ def capture(
         out: the scene's folder; an earlier capture in it is replaced.
         search: how poses are found.
         step: gives a ``Progress`` for each step.
-        frames: to choose from a video; None: see ``frames.frames_for``.
+        frames: to choose from a video; None: see ``frames.frames_for``, and twice as many where these do not
+            register.
         size: most pixels of the longer side; with poses that are known images are left as stored.
         force: go on where matches say that the camera stands or only turns.
 
@@ -60,10 +61,23 @@ def capture(
     about["files"] = [_fingerprint(path) for path in (source.path, source.masks) if path is not None]
     with work_folder(out, about) as work:
         images = take(work, source, step, count=frames, size=size, threads=search.threads)
-        if source.colmap is None:
-            found = find_poses(work, images, search, step, force)
-        else:
+        if source.colmap is not None:
             found = poses.read_model(source.colmap, images.originals)
+        else:
+            try:
+                found = find_poses(work, images, search, step, force)
+            except poses.TooFewRegistered:
+                more = min(images.found, 2 * len(images.times))
+                if frames is not None or source.video is None or more == len(images.times):
+                    raise
+                for left in work.iterdir():
+                    if left.name != _STATE:
+                        shutil.rmtree(left) if left.is_dir() else left.unlink()
+                why = f"of {len(images.times)} frames too few had poses"
+                with step(f"once more: {why}") as progress:
+                    progress(1, 1)
+                images = take(work, source, step, count=more, size=size, threads=search.threads, why=why)
+                found = find_poses(work, images, search, step, force)
         refuse_poses(found, images)
         found = scene.placed(found)
         limits = scene.limits_of(found)

@@ -504,6 +504,10 @@ def refuse_matches(database: Path, frames: Frames, force: bool = False) -> None:
         )
 
 
+class TooFewRegistered(ValueError):
+    """Poses of too few images were found; of a film, more frames may help."""
+
+
 def refuse_poses(found: Reconstruction | None, frames: Frames, database: Path | None = None) -> None:
     """Refuse poses of too few images, of a fisheye, of cameras that hardly move, and those that do not fit.
 
@@ -513,7 +517,7 @@ def refuse_poses(found: Reconstruction | None, frames: Frames, database: Path | 
         database: of features and matches, from which advice comes; None: the poses were known.
 
     Raises:
-        ValueError: with what was found, and advice.
+        TooFewRegistered, ValueError: with what was found, and advice.
     """
     registered, total = 0 if found is None else len(found.cameras), len(frames.times)
     if database is None and registered < MIN_MODEL:
@@ -522,7 +526,7 @@ def refuse_poses(found: Reconstruction | None, frames: Frames, database: Path | 
         )
     if database is not None and registered < max(MIN_MODEL, MIN_REGISTERED * total):
         advice = _advice(evidence_of(database), frames)
-        raise ValueError(
+        raise TooFewRegistered(
             f"poses: expected most of {total} pictures registered, but got {registered}; {advice}"
         )
     for name, camera in found.cameras.items():
