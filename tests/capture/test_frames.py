@@ -378,3 +378,42 @@ def test_hdr_comes_back_as_the_sdr_it_was_made_from(tmp_path, transfer):
     subprocess.run(call, input=3 * frame, check=True)
     (image,) = extracted(film, [1], None)
     assert np.abs(image - sdr).mean() < 2
+
+
+@pytest.mark.parametrize(
+    ("size", "weights", "tag"),
+    [
+        ((64, 48), (0.299, 0.114), None),
+        ((1280, 48), (0.2126, 0.0722), None),
+        ((64, 48), (0.2126, 0.0722), "bt709"),
+        ((1280, 48), (0.299, 0.114), "smpte170m"),
+    ],
+)
+@pytest.mark.parametrize("is_full", [False, True])
+def test_colours_are_those_that_the_tags_or_else_the_size_tell(tmp_path, size, weights, tag, is_full):
+    """Made by the formulas of BT.601 and BT.709."""
+    red, blue = weights
+    rgb = np.kron(np.random.default_rng(0).integers(20, 236, (6, size[0] // 8, 3)), np.ones((8, 8, 1)))
+    luma = rgb @ (red, 1 - red - blue, blue) / 255
+    chroma = [(rgb[..., i] / 255 - luma) / (2 - 2 * w) for i, w in ((2, blue), (0, red))]
+    low, high, wide = (0, 255, 255) if is_full else (16, 219, 224)
+    planes = np.stack([low + high * luma, *(128 + wide * c for c in chroma)]).round().clip(0, 255)
+    raw = ["-f", "rawvideo", "-pix_fmt", "yuv444p", "-s", f"{size[0]}x{size[1]}", "-i", "-"]
+    told = f"setparams=range={'pc' if is_full else 'tv'}" + (f":colorspace={tag}" if tag else "")
+    tags = ["-vf", told, "-color_range", "pc" if is_full else "tv", *(["-colorspace", tag] if tag else [])]
+    film = tmp_path / "a.mkv"
+    call = [
+        imageio_ffmpeg.get_ffmpeg_exe(),
+        "-v",
+        "error",
+        *raw,
+        *tags,
+        "-c:v",
+        "libx264",
+        "-qp",
+        "0",
+        str(film),
+    ]
+    subprocess.run(call, input=3 * planes.astype(np.uint8).tobytes(), check=True)
+    (image,) = extracted(film, [1], None)
+    assert np.abs(image - rgb).mean() < 2

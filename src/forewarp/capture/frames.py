@@ -42,6 +42,10 @@ _DURATION = re.compile(r"Duration: (\d+):(\d+):([\d.]+)")
 _DAMAGE = re.compile("partial file|ended prematurely|corrupt")
 _HDR = {"arib-std-b67": "HLG", "smpte2084": "PQ"}
 _TRANSFER = re.compile(r"Video: .*\b(" + "|".join(_HDR) + r")\b")
+# The tags of a stream, and its size; a matrix of colours stands first in its tag.
+_TAGS = re.compile(r"Video: [^,]*, \w+(?:\(([^)]*)\))?, (\d+)x(\d+)")
+_MATRIX = re.compile(r"\b(?<!/)(bt|smpte|fcc|gbr|ycg|ictcp)")
+_SD = 1024, 576  # pixels of the longer and the shorter side, at most
 # 203 cd/m2 are the white of SDR (BT.2408); below 0.8 of it colours stay, above they are compressed.
 _TO_SDR = (
     "zscale=tin={0}:pin=bt2020:min=bt2020nc:t=linear:npl=203:agamma=false,format=gbrpf32le,zscale=p=bt709,"
@@ -459,16 +463,31 @@ def extracted(
         fit = f"w='if(gt(iw,ih),min(iw,{size}),-1)':h='if(gt(iw,ih),-1,min(ih,{size}))'"
         filters += f",scale={fit}:flags=area"
     transfer = hdr_of(video)
+    filters = "setparams=colorspace=bt709," + filters if _is_untagged_hd(video) else filters
     filters += f",{_TO_SDR.format(transfer)}" if transfer else ""
     yield from _decode(video, f"{filters},format=rgb24", "ppm", _Log(), threads)
 
 
 def hdr_of(video: Path) -> str | None:
     """Return ffmpeg's name of the transfer of an HDR video, HLG or PQ; None: it is SDR."""
-    call = [imageio_ffmpeg.get_ffmpeg_exe(), "-hide_banner", "-nostdin", "-i", str(video)]
-    said = subprocess.run(call, capture_output=True).stderr.decode(errors="replace")
-    match = _TRANSFER.search(said)
+    match = _TRANSFER.search(_header(video))
     return match and match[1]
+
+
+def _is_untagged_hd(video: Path) -> bool:
+    """Tell whether a video does not say its matrix of colours and is larger than SD: players take it for
+    BT.709, ffmpeg for BT.601, which is right for SD.
+    """
+    match = _TAGS.search(_header(video))
+    if match is None or _MATRIX.search(match[1] or ""):
+        return False
+    return any(side > most for side, most in zip(sorted(map(int, match.groups()[1:]), reverse=True), _SD))
+
+
+def _header(video: Path) -> str:
+    """Return what ffmpeg says of a video."""
+    call = [imageio_ffmpeg.get_ffmpeg_exe(), "-hide_banner", "-nostdin", "-i", str(video)]
+    return subprocess.run(call, capture_output=True).stderr.decode(errors="replace")
 
 
 class _Log:
