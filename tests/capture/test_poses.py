@@ -230,15 +230,35 @@ def test_images_keep_their_numbers_whatever_is_looked_at_first(tmp_path):
         assert poses.evidence_of(database).features > 50
 
 
+def database_of(folder, images):
+    """Features and matches of images (N, H, W, 3) uint8."""
+    (folder / "images").mkdir(parents=True)
+    for number, pixels in enumerate(images):
+        Image.fromarray(pixels).save(folder / "images" / f"{number:02d}.png")
+    search, quiet = Search(threads=1), lambda done, total: None
+    database = poses.find_features(folder, folder / "images", None, search, quiet)
+    poses.match(database, search, quiet)
+    return database
+
+
+@pytest.mark.slow
+def test_a_logo_in_a_film_is_found_and_the_film_without_has_none(tmp_path):
+    times = np.linspace(0, 1, 8)
+    cameras = cameras_of(WALKS["room"], times, 3.0, (320, 240))
+    images = np.stack(list(pictures_of(WALKS["room"], times, cameras, samples=1, workers=1)))
+    assert not poses.burnt_in(database_of(tmp_path / "clean", images)).any()
+    images[:, 10:58, 230:310] = (
+        np.random.default_rng(0).integers(0, 256, (8, 10, 3)).repeat(6, 0).repeat(8, 1)
+    )
+    burnt = poses.burnt_in(database_of(tmp_path / "logo", images))
+    assert burnt[10:58, 230:310].mean() > 0.9
+    assert burnt.mean() < 0.15
+
+
 @pytest.mark.slow
 def test_an_orbit_with_a_long_lens_is_no_turn(tmp_path):
     walk = replace(WALKS["room"], radius=10.0, angle=17.0)
     times = np.linspace(0, 1, 10)
-    (tmp_path / "images").mkdir()
     cameras = cameras_of(walk, times, 3.0, (320, 240))
-    for number, pixels in enumerate(pictures_of(walk, times, cameras, samples=1, workers=1)):
-        Image.fromarray(pixels).save(tmp_path / "images" / f"{number:02d}.png")
-    search, quiet = Search(threads=1), lambda done, total: None
-    database = poses.find_features(tmp_path, tmp_path / "images", None, search, quiet)
-    poses.match(database, search, quiet)
-    assert poses.evidence_of(database).unrotated > 1.3 * poses.TURNED
+    images = pictures_of(walk, times, cameras, samples=1, workers=1)
+    assert poses.evidence_of(database_of(tmp_path, images)).unrotated > 1.3 * poses.TURNED
