@@ -467,7 +467,7 @@ OF_THE_NICHE = {
 def test_fields_that_know_the_time_show_what_appears_better_than_bent_ones(tmp_path):
     """Each beside the one that it adds the time, or its slice, to."""
     psnr, rates = {}, {"lr": {"network": 3e-3}, "lr_final_factor": 0.1}
-    settings = StageSettings.of("fine", iterations=2000, curriculum={"all_in": 0.0}, **rates)
+    settings = StageSettings.of("fine", iterations=1500, curriculum={"all_in": 0.0}, **rates)
     for kind, model in OF_THE_NICHE.items():
         weights = {"photo": 1.0} | ({"elastic": 1e-3} if kind == "nerfies" else {})
         data = SceneDataModule(niche_scene, rays=128, seed=2)
