@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+from forewarp.data.files import SceneError
 from forewarp.data.images import write_image
 from forewarp.data.nhr import read_scene
 from tests.support.written_scenes import BALLS, COLORS, STEP, dome, dome_frames, dome_truth, place, write_dome
@@ -171,12 +172,15 @@ def test_an_excerpt_is_read_in_order(toy):
                 (folder / f"img_{k:04d}.jpg").rename(folder / f"img_{k + 1:04d}.jpg")
         (toy / "img" / str(f)).rename(toy / "img" / f"{number:03d}")
         (toy / "pointclouds" / f"frame{f + 1}.npy").rename(toy / "pointclouds" / f"frame{number + 1}.npy")
-    for _ in range(2):
+    for renumbered in (False, True):
         scene = read_scene(toy.parent, "toy")
         assert [frame.name for frame in scene.test] == ["008/img_0001", "010/img_0001", "014/img_0001"]
         assert (scene.times, scene.box) == ((0, 1 / 3, 1), expected.box)
         assert torch.equal(scene.train[4].load(), image)
-        assert "frames 8 to 14 (3) and cameras from 1 taken in order" in scene.protocol["assumed"][0]
+        line, *others = scene.protocol["assumed"]
+        assert "frames 8 to 14 (3) and cameras from 1 taken in order" in line
+        said = "pointclouds: frame0.npy to frame2.npy (3) taken in the order of the frames"
+        assert [said in other for other in others] == [True] * renumbered
         for number, f in ((9, 0), (11, 1), (15, 2)):
             if (cloud := toy / "pointclouds" / f"frame{number}.npy").exists():
                 cloud.rename(cloud.with_name(f"frame{f}.npy"))
@@ -190,3 +194,25 @@ def test_reading_a_scene_decodes_no_image(written, monkeypatch):
     scene = read_scene(written, "toy")
     with pytest.raises(AssertionError):
         scene.train[0].load()
+
+
+def test_clouds_of_other_frames_are_not_taken(toy):
+    """Frames 8 to 10 are there, clouds 1 to 11 less the tenth, which is frame 9's."""
+    for f in range(3):
+        (toy / "img" / str(f)).rename(toy / "img" / str(f + 8))
+    for number in (4, 5, 6, 7, 8, 9, 11):
+        shutil.copy(toy / "pointclouds" / "frame1.npy", toy / "pointclouds" / f"frame{number}.npy")
+    with pytest.raises(SceneError, match=r"frame10\.npy: expected"):
+        read_scene(toy.parent, "toy")
+
+
+def test_two_folders_of_one_number_are_named(toy):
+    shutil.copytree(toy / "img" / "2", toy / "img" / "002")
+    with pytest.raises(SceneError, match=r"got 002 and 2; remove one"):
+        read_scene(toy.parent, "toy")
+
+
+def test_an_image_that_is_missing_in_the_first_frame_is_named(toy):
+    (toy / "img" / "0" / "img_0000.jpg").unlink()
+    with pytest.raises(SceneError, match=r"0/img_0000\.jpg: expected"):
+        read_scene(toy.parent, "toy")

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -76,17 +77,18 @@ def read_scene(
     held = _held_out(test_views, len(poses), folder)
     every, moments = whole(test_every, "data.test_every", 1), whole(frames, "data.frames", 1)
     there = (path for path in folder.glob("img/*") if path.is_dir() and path.name.isdecimal())
-    places = sorted(there, key=lambda path: int(path.name))
+    places = sorted(there, key=lambda path: (int(path.name), path.name))
     on_disk = [int(path.name) for path in places]
-    if not places or len({*on_disk}) < len(places):
-        got = f"{places[0].name} and one of the same number" if places else "none"
-        raise mismatch(folder / "img", "a folder of images for each frame, named by its number", got)
+    twice = [f"{a.name} and {b.name}" for a, b in pairwise(places) if int(a.name) == int(b.name)]
+    if twice or not places:
+        expected, got = "a folder of images for each frame, named by its number", "".join(twice[:1]) or "none"
+        raise mismatch(folder / "img", expected, got, "remove one" if twice else "")
     numbers, moments = on_disk[:moments], min(moments, len(places))
-    counted = (path.stem[4:] for path in places[0].glob("img_*.jpg"))
+    counted = (path.stem[4:] for place in places for path in place.glob("img_*.jpg"))
     first = min((int(number) for number in counted if number.isdecimal()), default=0)
     names = [f"img_{k:04d}.jpg" for k in range(first, first + len(poses))]
     sizes = _read_sizes(places[:moments], names, half_resolution)
-    bounds = _bounds(folder, numbers) if box is None else box_of(box)
+    bounds, assumed = _bounds(folder, numbers, len(places)) if box is None else (box_of(box), [])
     cameras = [_camera(*of, half_resolution, bounds) for of in zip(sizes, matrices, poses, strict=True)]
     for number, camera in enumerate(cameras):
         check_middle(camera, f"{folder / 'Intrinsic.inf'}: camera {number}")
@@ -112,7 +114,8 @@ def read_scene(
     }
     if on_disk[0] != 0 or first != 0 or on_disk[-1] - on_disk[0] >= len(on_disk):
         said = f"frames {on_disk[0]} to {on_disk[-1]} ({len(on_disk)}) and cameras from {first}"
-        protocol["assumed"] = [f"{folder / 'img'}: {said} taken in order, times by their numbers"]
+        line = f"{folder / 'img'}: {said} taken in order, times by their numbers"
+        protocol["assumed"] = [line, *assumed]
     truth = read_truth(folder / "trajectories.npz", 0.0)
     if truth is not None and moments < len(places):  # the file's times are those of all frames on disk
         truth = shortened(truth, (numbers[-1] - numbers[0]) / (on_disk[-1] - on_disk[0]))
@@ -231,18 +234,22 @@ def _read_sizes(folders: Sequence[Path], names: Sequence[str], halve: bool) -> l
     return sizes
 
 
-def _bounds(folder: Path, numbers: Sequence[int]) -> Box:
-    """Put a box around the points of the frames of these numbers, with some padding.
+def _bounds(folder: Path, numbers: Sequence[int], count: int) -> tuple[Box, list[str]]:
+    """Put a box around the points of the frames of these numbers, the first of ``count``, with some padding.
 
-    A cloud's number is its frame's and 1, or those of an excerpt are in the frames' order.
+    A cloud's number is its frame's and 1; as many clouds as frames, of an excerpt, may be in their order,
+    which the lines that come with the box say.
     """
     clouds: dict[int, Path] = {}
     for path in (*folder.glob("pointclouds/frame*.obj"), *folder.glob("pointclouds/frame*.npy")):  # .npy wins
         if path.stem[5:].isdecimal():
             clouds[int(path.stem[5:])] = path
     chosen = [clouds.get(number + 1, folder / "pointclouds" / f"frame{number + 1}.npy") for number in numbers]
-    if not all(path.is_file() for path in chosen) and len(clouds) >= len(numbers) and numbers[0] != 0:
+    assumed, are_there = [], all(path.is_file() for path in chosen)
+    if not are_there and len(clouds) == count and numbers[0] != 0:
         chosen = [clouds[number] for number in sorted(clouds)][: len(numbers)]
+        said = f"{chosen[0].name} to {chosen[-1].name} ({len(chosen)}) taken in the order of the frames"
+        assumed = [f"{folder / 'pointclouds'}: {said}"]
     corners = []
     for path in chosen:
         points = read_cloud(path, 6)[:, :3]
@@ -250,7 +257,7 @@ def _bounds(folder: Path, numbers: Sequence[int]) -> Box:
     low, high = np.min(corners, 0).astype(np.float64), np.max(corners, 0).astype(np.float64)
     margin = _PADDING * (high - low)
     try:
-        return Box(tuple((low - margin).tolist()), tuple((high + margin).tolist()))
+        return Box(tuple((low - margin).tolist()), tuple((high + margin).tolist())), assumed
     except ValueError as error:
         got = f"{low.tolist()} to {high.tolist()}"
         raise mismatch(folder / "pointclouds", "points that span a box", got, "set data.box") from error
