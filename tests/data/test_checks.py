@@ -8,10 +8,12 @@ import pytest
 import torch
 
 from forewarp.data import dnerf, nhr, posed_video
-from forewarp.data.checks import remarks
+from forewarp.data.checks import check_seen, remarks
 from forewarp.data.files import SceneError
 from forewarp.data.images import is_premultiplied, straight, write_image
 from forewarp.scene.box import Box
+from forewarp.scene.camera import Camera, look_at
+from forewarp.scene.frame import Frame, sightings
 from tests.support.tiny_scene import ball_scene
 from tests.support.written_scenes import (
     MIDDLE,
@@ -70,7 +72,9 @@ def test_what_contradicts_itself_is_told(scene, said):
 
 
 def test_images_without_a_subject_are_refused_and_few_of_them_told():
-    with pytest.raises(SceneError, match="expected a subject in some training images, but got none in 8"):
+    with pytest.raises(
+        SceneError, match="r_0.*expected a subject in some .* 0 everywhere in all 8; mend alpha"
+    ):
         list(remarks(changed(with_alpha(torch.zeros_like))))
     shown = [False, True, False, False, True, False, False, False]
     train = tuple(
@@ -157,3 +161,76 @@ def test_straight_dark_and_opaque_images_are_left_as_they_are():
     assert not is_premultiplied([torch.full((8, 8, 4), 255, dtype=torch.uint8)])
     assert is_premultiplied([torch.from_numpy(ball(True))] * 4)
     assert torch.equal(straight(images["straight"])[32, 32], images["straight"][32, 32])
+
+
+def test_smoke_is_a_subject_and_one_that_comes_late_is_only_told(tmp_path):
+    """The greatest alpha of smoke is 110; of 60 images only four, none of the eight looked at, show it."""
+    assert list(remarks(changed(with_alpha(lambda alpha: (alpha * (110 / 255)).byte())))) == []
+    late = [replace(SCENE.train[i % 8], load=lambda: torch.zeros(16, 16, 4).byte()) for i in range(60)]
+    late[1:5] = SCENE.train[1:5]
+    (line,) = remarks(replace(SCENE, train=tuple(late)))
+    assert line.startswith("8 of 8 training images looked at show no subject")
+    views = posed_cameras(4, (20, 30))
+    empty = np.zeros((20, 30, 4), np.uint8)
+    shots = [posed_video.PosedShot(f"{i}.png", view, empty) for i, view in enumerate(views)]
+    posed_video.write_scene(tmp_path / "toy", shots)
+    with pytest.raises(SceneError, match=r"toy.*0\.png: expected a subject .*; set data.masks=off, or mend"):
+        list(remarks(posed_video.read_scene(tmp_path, "toy")))
+
+
+@pytest.mark.parametrize(
+    ("dataset", "near", "box", "seen"),
+    [
+        ("nhr", "mend the point clouds, or set data.box=", *["mend the point clouds, or set data.box="] * 2),
+        ("hypernerf", "mend near in scene.json", *["mend scene.json, or set data.box=null"] * 2),
+        (
+            "video_with_poses",
+            "set data.near, or mend the file's",
+            "set data.box=null, or mend",
+            "set data.box",
+        ),
+        ("dnerf", "set data.near", "set data.box=null", "set data.box=null data.near=null data.far=null"),
+    ],
+)
+def test_what_mends_it_is_of_the_format_and_one_cause_has_one_line(dataset, near, box, seen):
+    protocol, away = {"dataset": dataset}, Box((50, 50, 50), (51, 51, 51))
+    (line,) = remarks(changed(train=ranged(30.0, 60.0), protocol=protocol))
+    assert f"near at 30; {near}" in line
+    (line,) = remarks(changed(train=ranged(30.0, 60.0), box=away, protocol=protocol))
+    assert f"lies far outside the box (50, 50, 50) to (51, 51, 51); {box}" in line
+    with pytest.raises(SceneError) as error:
+        check_seen(changed(box=away, protocol=protocol))
+    assert seen in str(error.value)
+    for key in ("data.near", "data.far") if dataset in ("nhr", "hypernerf") else ():
+        assert key not in f"{near} {error.value}"
+
+
+def test_point_clouds_in_millimetres_have_one_line_with_a_key_that_is_there(tmp_path):
+    folder = write_dome(tmp_path / "toy")
+    for path in folder.glob("pointclouds/*.npy"):
+        cloud = np.load(path)
+        cloud[:, :3] *= 1000
+        np.save(path, cloud)
+    lines = list(remarks(nhr.read_scene(tmp_path, "toy")))
+    assert len(lines) == 1
+    assert lines[0].endswith("mend the point clouds, or set data.box=[x0,y0,z0,x1,y1,z1]")
+
+
+def test_all_cameras_of_a_long_walk_are_asked_for_points_at_no_cost_of_their_size(monkeypatch):
+    """Cameras every metre along a street look across; points are 3 m away; masks of 12 Mpx are not made."""
+    up, frames, bytes_of = torch.tensor([0.0, 0.0, 1.0]), [], []
+
+    def measured(points, cameras, masks):
+        bytes_of.extend(mask.untyped_storage().nbytes() for mask in masks)
+        return sightings(points, cameras, masks)
+
+    monkeypatch.setattr("forewarp.data.checks.sightings", measured)
+    for i in range(400):
+        eye = torch.tensor([float(i), 0.0, 0.0])
+        pose = look_at(eye, eye + torch.tensor([0.0, 3.0, 0.0]), up)
+        camera = Camera(4000, 3000, 12000.0, 12000.0, 2000.0, 1500.0, pose, 0.1, 10.0)
+        frames.append(Frame(f"{i}", i / 399, camera, lambda: torch.zeros(1)))
+    points = torch.stack([torch.linspace(0, 399, 2000), torch.full((2000,), 3.0), torch.zeros(2000)], 1)
+    box = Box((-1, 0, -1), (400, 4, 1))
+    assert list(remarks(replace(SCENE, train=tuple(frames), box=box, has_alpha=False, still=points))) == []
+    assert (len(bytes_of), sum(bytes_of)) == (400, 400)

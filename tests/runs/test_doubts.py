@@ -57,6 +57,9 @@ def test_cameras_that_see_nothing_of_the_box_are_counted():
     assert (blind_frames(SCENE), blind_frames(scene)) == (0, 1)
     (line,) = doubts(run(scene=scene), reaching(30))
     assert line.startswith(f"1 of {len(scene.train)} training cameras see nothing of the box")
+    in_file = {"normalisation": {"center": [10.0, 0.0, 0.0], "scale": 0.5}}  # remarks and data.box are of it
+    (line,) = doubts(run(scene=replace(scene, protocol=in_file)), reaching(30))
+    assert line.endswith("the box (8, -1.6, -1.4) to (12.4, 1.6, 1.4)")
 
 
 def test_images_that_never_came_in_are_counted():

@@ -16,9 +16,19 @@ from forewarp.scene.frame import Scene, sightings, spread
 
 _LOOKED_AT = 8  # training images whose alpha is looked at
 _PIXELS = 4000  # of each
-_OPAQUE = 127  # alpha above it is of the subject
 _EDGE, _LEFT_OUT = 0.9, 0.02  # shares of an inverted image: subject along its edges, background at least
 _CUT_OFF, _FEW = 0.1, 0.5  # share of the subject beyond the box; of pixels and points that is too few
+# What mends near or far, the box, and all three, by format; "" is any other.
+_REMEDIES = {
+    "nhr": ("mend the point clouds, or set data.box=[x0,y0,z0,x1,y1,z1]",) * 3,
+    "hypernerf": ("mend {key} in scene.json", *("mend scene.json, or set data.box=null",) * 2),
+    "video_with_poses": (
+        "set data.{key}, or mend the file's",
+        "set data.box=null, or mend the file's aabb",
+        "set data.box=null data.near=null data.far=null, or mend the file's aabb, near and far",
+    ),
+    "": ("set data.{key}", "set data.box=null", "set data.box=null data.near=null data.far=null"),
+}
 
 
 def remarks(scene: Scene) -> Iterator[str]:
@@ -28,15 +38,15 @@ def remarks(scene: Scene) -> Iterator[str]:
     inverted, empty or opaque alpha and masks; masks that leave little; points that no camera sees.
 
     Raises:
-        SceneError: if no image that is looked at shows anything.
+        SceneError: if no training image shows anything.
 
-    Cost: eight training images are decoded, which training does anyway.
+    Cost: eight training images are decoded, which training does anyway; all, where those show nothing.
     """
     aim = common_point([frame.camera.camera_to_world for frame in scene.train])
-    if aim is not None:
-        yield from _aimed(scene, aim)
+    aside = [] if aim is None else list(_aimed(scene, aim))
+    yield from aside
     if scene.has_alpha:
-        yield from _silhouettes(scene)
+        yield from _silhouettes(scene, bounded=not aside)
     if masked := [frame.load_valid for frame in scene.train if frame.load_valid is not None]:
         share = sum(float(masked[i]().float().mean()) for i in spread(len(masked), _LOOKED_AT))
         share /= min(len(masked), _LOOKED_AT)
@@ -46,9 +56,10 @@ def remarks(scene: Scene) -> Iterator[str]:
                 "subject, set data.masks=alpha, if it is the subject, invert them"
             )
     if scene.still is not None:
-        cameras = [scene.train[i].camera for i in spread(len(scene.train), 8 * _LOOKED_AT)]
+        cameras = [frame.camera for frame in scene.train]
+        images = [torch.ones((), dtype=torch.bool).expand(c.height, c.width) for c in cameras]
         some = scene.still[:: max(1, len(scene.still) // _PIXELS)].double()
-        seen = sightings(some, cameras, [torch.ones(c.height, c.width) > 0 for c in cameras])[1]
+        seen = sightings(some, cameras, images)[1]
         if (share := float((seen > 0).double().mean())) < _FEW:
             yield (
                 f"training cameras see {share:.0%} of the {len(scene.still)} points that never move, as if "
@@ -57,21 +68,28 @@ def remarks(scene: Scene) -> Iterator[str]:
 
 
 def _aimed(scene: Scene, aim: Tensor) -> Iterator[str]:
-    """Compare near, far and the box with the point (3,) that the cameras look at, in the file's units."""
+    """Compare the box, else near and far, with the point (3,) that cameras look at, in the file's units."""
     point = f"the point that all cameras look at, {_in_file(scene, aim.tolist())},"
+    if not scene.box.scaled(2).holds(aim):
+        yield f"{point} lies far outside the box {bounds(scene)}; {_remedy(scene, 'box')}"
+        return  # near and far may follow from it
     cameras = [frame.camera for frame in scene.train]
     away = torch.stack([(aim - camera.center).norm() for camera in cameras])
     near, far = (torch.tensor([getattr(camera, end) for camera in cameras]) for end in ("near", "far"))
     for key, bound, beyond in (("near", near, away < near), ("far", far, away > far)):
         if float(beyond.double().mean()) > _FEW:
             distance, at = (_length(scene, float(values.median())) for values in (away, bound))
-            yield f"{point} is {distance} away, with {key} at {at}; set data.{key}, or mend the file's"
-    if not scene.box.scaled(2).holds(aim):
-        yield f"{point} lies far outside the box {_bounds(scene)}; set data.box=null"
+            yield f"{point} is {distance} away, with {key} at {at}; {_remedy(scene, key)}"
 
 
-def _bounds(scene: Scene) -> str:
-    """Write the box, in the file's units."""
+def _remedy(scene: Scene, key: str) -> str:
+    """Say what mends ``near``, ``far``, the ``box`` or ``all`` of them in a scene of this format."""
+    remedies = _REMEDIES.get(scene.protocol.get("dataset"), _REMEDIES[""])
+    return remedies[{"box": 1, "all": 2}.get(key, 0)].format(key=key)
+
+
+def bounds(scene: Scene) -> str:
+    """Write a scene's box, in the file's units."""
     return f"{_in_file(scene, scene.box.low)} to {_in_file(scene, scene.box.high)}"
 
 
@@ -87,14 +105,20 @@ def _in_file(scene: Scene, place: Sequence[float]) -> str:
     return f"({', '.join(f'{round(value, 9) + 0.0:.4g}' for value in values)})"
 
 
-def _silhouettes(scene: Scene) -> Iterator[str]:
-    """Look at the alpha of a few training images: does it cut out a subject, and is that in the box?"""
+def _silhouettes(scene: Scene, *, bounded: bool) -> Iterator[str]:
+    """Look at the alpha of a few training images: does it cut out a subject, and, if ``bounded``, is that in
+    the box? The subject is where alpha is above half of its greatest value, also of smoke or glass.
+    """
     frames = [scene.train[i] for i in spread(len(scene.train), _LOOKED_AT)]
-    solid = [frame.load()[..., 3] > _OPAQUE for frame in frames]
+    alphas = [frame.load()[..., 3].clone() for frame in frames]
+    half = max(int(alpha.max()) for alpha in alphas) // 2
+    solid = [alpha > half for alpha in alphas]
     empty = [not bool(mask.any()) for mask in solid]
-    if all(empty):
-        expected, got = "a subject in some training images", f"none in {len(frames)} of them"
-        raise mismatch(frames[0].name, expected, got, "alpha, or masks, are dark everywhere")
+    if all(empty) and not any(bool(frame.load()[..., 3].any()) for frame in scene.train):
+        place = f"{frames[0].name}: {getattr(frames[0].load, 'path', 'alpha')}"
+        got = f"alpha or masks that are 0 everywhere in all {len(scene.train)}"
+        off = "set data.masks=off, or " if scene.protocol.get("dataset") == "video_with_poses" else ""
+        raise mismatch(place, "a subject in some training images", got, f"{off}mend alpha or masks")
     if sum(empty) > _FEW * len(frames):
         yield f"{sum(empty)} of {len(frames)} training images looked at show no subject; mend alpha or masks"
     if all(bool(mask.all()) for mask in solid):
@@ -105,6 +129,8 @@ def _silhouettes(scene: Scene) -> Iterator[str]:
             f"in {sum(turned)} of {len(frames)} training images looked at the subject fills all edges, as if "
             "alpha or masks were inverted; invert them"
         )
+        bounded = False  # what is solid is not the subject
+    if not bounded:
         return
     missed = total = 0
     for frame, mask in zip(frames, solid):
@@ -113,8 +139,8 @@ def _silhouettes(scene: Scene) -> Iterator[str]:
         missed, total = missed + int((~meets(frame.camera, scene.box, pixels)).sum()), total + len(pixels)
     if missed > _CUT_OFF * total:
         yield (
-            f"{missed / total:.0%} of the subject's pixels see nothing of the box {_bounds(scene)} between "
-            "near and far; widen data.box, data.near, data.far, or set them to null"
+            f"{missed / total:.0%} of the subject's pixels see nothing of the box {bounds(scene)} between "
+            f"near and far; {_remedy(scene, 'all')}"
         )
 
 
@@ -145,10 +171,10 @@ def check_seen(scene: Scene) -> None:
     focus = focus_point([frame.camera for frame in scene.train]).tolist()
     near, far = (_length(scene, getattr(scene.train[0].camera, end)) for end in ("near", "far"))
     raise mismatch(
-        "data.box, data.near, data.far",
+        f"{scene.name}: box, near, far",
         "a box that cameras see between near and far",
-        f"{_bounds(scene)}, near {near}, far {far}; cameras look at {_in_file(scene, focus)}",
-        "set data.box=null data.near=null data.far=null, or mend what they are of, as points in other units",
+        f"{bounds(scene)}, near {near}, far {far}; cameras look at {_in_file(scene, focus)}",
+        _remedy(scene, "all"),
     )
 
 

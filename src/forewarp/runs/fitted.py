@@ -18,7 +18,7 @@ from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
 from forewarp.data.batches import color_of
-from forewarp.data.checks import blind_frames
+from forewarp.data.checks import blind_frames, bounds
 from forewarp.evaluation.evaluate import evaluate, mean_scores, show
 from forewarp.files import read_json, write_json
 from forewarp.methods.method import HasMatter, HasTrajectories, Method, Snapshot
@@ -334,7 +334,7 @@ def doubts(run: Run, module: DynamicSceneModule) -> list[str]:
             "the budget ended before their times came in; raise it"
         )
     if blind := blind_frames(scene):
-        lines.append(f"{blind} of {len(scene.train)} training cameras see nothing of the box {scene.box}")
+        lines.append(f"{blind} of {len(scene.train)} training cameras see nothing of the box {bounds(scene)}")
     reached, one_color = training_psnr(run, module)
     if reached < max(LOW, one_color + ABOVE):
         lines.append(
