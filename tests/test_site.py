@@ -14,7 +14,7 @@ from types import SimpleNamespace
 import pytest
 import yaml
 
-from forewarp.runs.config_files import option_groups
+from forewarp.runs.sections import option_groups
 from tests.support.browser import Tab, chromium, until
 from tests.support.commands import call
 from tests.support.configs import CONF, ROOT

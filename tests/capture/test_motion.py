@@ -6,7 +6,7 @@ import torch
 
 pytest.importorskip("cv2")
 
-from forewarp.capture.frames import frames_for  # noqa: E402
+from forewarp.capture.frames import frames_for, speed  # noqa: E402
 from forewarp.capture.motion import moving_masks  # noqa: E402
 from forewarp.data.images import write_image  # noqa: E402
 from forewarp.scene.camera import Camera  # noqa: E402
@@ -31,11 +31,15 @@ def film(folder, patch_speed):
         image[mask] = texture[1][:40, :50].reshape(-1, 3)
         paths.append(folder / f"{i:02d}.png")
         write_image(paths[-1], image)
-        pose = torch.eye(4, dtype=torch.float64)
-        pose[0, 3] = 3 * i / FOCAL
-        cameras.append(Camera(WIDTH, HEIGHT, FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2, pose, 0.1, 10.0))
+        cameras.append(pinhole(3 * i / FOCAL))
         truth.append(mask)
     return paths, cameras, truth
+
+
+def pinhole(x=0.0):
+    pose = torch.eye(4, dtype=torch.float64)
+    pose[0, 3] = x
+    return Camera(WIDTH, HEIGHT, FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2, pose, 0.1, 10.0)
 
 
 def test_what_goes_another_way_than_the_camera_makes_it_go_is_found(tmp_path):
@@ -52,6 +56,32 @@ def test_a_film_in_which_only_the_camera_moves_has_no_movers(tmp_path):
     assert not any(mask.any() for mask in moving_masks(paths, cameras))
 
 
+@pytest.mark.parametrize("step", [0.0, 3.0])
+def test_what_is_far_away_and_what_a_resting_camera_sees_rest(tmp_path, step):
+    """The upper half is so far away that it does not shift; poses are off by noise."""
+    draw = np.random.default_rng(1)
+    wall = draw.integers(0, 255, (30, 90, 3)).astype(np.uint8).repeat(4, 0).repeat(4, 1)
+    paths, cameras = [], []
+    for i in range(COUNT):
+        at = round(step * i)
+        paths.append(tmp_path / f"{i:02d}.png")
+        write_image(paths[-1], np.concatenate([wall[:60, :WIDTH], wall[60:, at : at + WIDTH]]))
+        cameras.append(pinhole(step * i / FOCAL + 1e-3 * draw.standard_normal()))
+    assert max(mask.mean() for mask in moving_masks(paths, cameras)) < 0.02
+
+
+def test_of_images_that_cannot_be_followed_nothing_is_told(tmp_path):
+    draw, paths = np.random.default_rng(2), [tmp_path / f"{i}.png" for i in range(6)]
+    for path in paths:
+        write_image(path, draw.integers(0, 255, (HEIGHT, WIDTH, 3)).astype(np.uint8))
+    assert list(moving_masks(paths, [pinhole()] * 6)) == [None] * 6
+
+
 def test_fast_films_give_more_frames():
     slow, fast, faster = (frames_for(np.full(600, speed))[0] for speed in (0.1, 3.0, 30.0))
     assert (slow, fast, faster) == (120, 225, 300)
+
+
+def test_the_motion_of_very_wide_images_is_measured():
+    image = np.random.default_rng(0).integers(0, 255, (10, 160)).astype(np.uint8).repeat(4, 0).repeat(4, 1)
+    assert np.isfinite(speed(image, np.roll(image, 4, 1)))

@@ -69,6 +69,7 @@ def test_a_film_whose_poses_fail_is_tried_with_more_frames(tmp_path, monkeypatch
     tried = []
 
     def take(work, source, step, *, count, size, threads, why="none"):
+        (work / "pictures.json").touch()
         names = [f"{i:03d}" for i in range(count or 200)]
         return Frames(work, None, dict.fromkeys(names, 0.0), range(len(names)), 600, 2.0, {}, {}, why=why)
 
@@ -81,7 +82,7 @@ def test_a_film_whose_poses_fail_is_tried_with_more_frames(tmp_path, monkeypatch
     step = lambda title: nullcontext(lambda done, total: None)  # noqa: E731
     for frames, expected in ((None, [200, 400]), (50, [50])):
         tried.clear()
-        with pytest.raises(TooFewRegistered, match=f"few of {expected[-1]}"):
+        with pytest.raises(ValueError, match=f"few of {expected[-1]}"):
             capture(Source(video=tmp_path / "a.mp4"), tmp_path / "out", Search(), step, frames=frames)
         assert [count for count, _ in tried] == expected
-    assert tried[-1] == (50, "none")
+        assert [why for _, why in tried][1:] == [pipeline._AGAIN] * (len(expected) - 1)

@@ -135,9 +135,9 @@ def test_what_follows_an_option_is_no_run(in_tmp):
     words = ["--config-dir", "demo", "demo", "run=demo", "-x", "other"]
     assert with_run_key("render", words) == ["--config-dir", "demo", "run=demo", "run=demo", "-x", "other"]
     assert with_run_key("report", ["demo"]) == ["demo"]
-    for name in ("~a", "a=b"):
+    for name in ("~stage.coarse", "seed=0"):  # an override, though a sweep's folder has this name
         (in_tmp / name).mkdir()
-        assert with_run_key("render", [name]) == [f"run={name}"]
+        assert with_run_key("render", [name, f"./{name}"]) == [name, f"run=./{name}"]
 
 
 def test_an_interpolation_is_typed_as_it_is(refused, in_tmp):

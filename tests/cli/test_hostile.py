@@ -52,7 +52,7 @@ def synthetic(outside):
     return {"_target_": target, "root": str(outside), "scene": "new", "synthesis": {}}
 
 
-KINDS = {  # what is wrong with the folder -> how it is made, what the refusal names, and who opens it
+KINDS = {  # what is wrong with the folder -> how it is made, what the refusal names, and who is quick to open it
     "planned": (within("planned", lambda outside: f"{outside}/secret"), None, ["train"]),
     "callback": (within("callbacks.x", keeper), "callbacks.x._target_", ["train", "export", "report"]),
     "logger": (within("logger.log_dir", lambda outside: str(outside)), "logger.log_dir", ["evaluate"]),
@@ -80,7 +80,14 @@ def outside(in_tmp):
     return in_tmp / "outside"
 
 
-@pytest.mark.parametrize(("kind", "name"), [(kind, name) for kind in KINDS for name in KINDS[kind][2]])
+ATTACKS = [
+    pytest.param(kind, name, marks=() if name in quick else pytest.mark.slow)
+    for kind, (_, named, quick) in KINDS.items()
+    for name in (OPENS if named else quick)
+]
+
+
+@pytest.mark.parametrize(("kind", "name"), ATTACKS)
 def test_nothing_outside_is_written(kind, name, fitted, outside, forewarp):
     make, named, _ = KINDS[kind]
     run = Path(shutil.copytree(fitted, "run"))

@@ -4,7 +4,7 @@ import pytest
 from hydra.core.object_type import ObjectType
 from hydra.errors import ConfigCompositionException
 
-from forewarp.runs.config_files import FileConfigSource, option_groups
+from forewarp.runs.sections import FileConfigSource, option_groups
 from tests.support.configs import CONF, composed
 
 MINE = {

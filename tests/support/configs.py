@@ -7,7 +7,8 @@ from pathlib import Path
 from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig
 
-from forewarp.runs.config_files import configurations, option_groups
+from forewarp.runs.config_files import configurations
+from forewarp.runs.sections import option_groups
 
 ROOT = Path(__file__).parents[2]
 CONF = ROOT / "conf"

@@ -28,11 +28,13 @@ from forewarp.files import read_json, write_json
 Progress = Callable[[int, int], None]
 Step = Callable[[str], object]  # title of a step -> a context manager that gives a ``Progress``
 
-_DONE = "pictures.json"  # written last
+TAKEN = "pictures.json"  # what was taken; written last
 _MOVING = 127  # a mask above it is what moves
 _MIN_IMAGES, _SHORT, _ENOUGH, _MOST = 3, 150, 120, 300  # frames: fewest, of a short film, of a slow one, most
 _STEP = 8.0  # pixels of 640, by which what is fast may move from one frame that is taken to the next
 _FAST, _FLOW = 0.9, 160  # quantile of an image's motion that counts; pixels of the longer side to measure it
+_LEAST_SIDE = 32  # pixels that OpenCV's flow needs; of fewer it crashes
+_SAME = 0.3  # mean difference of two images, of 255, below which one repeats the other
 _MEASURED = 640  # pixels of the longer side at which sharpness is measured
 _COARSE = 160  # pixels of the longer side at which blur is told from what a codec adds
 _FLAT = 1e-9  # mean square of a second difference below which an image has no edges
@@ -124,7 +126,7 @@ def take(
         ValueError: where they cannot be read or are too few.
     """
     folder, dark = work / "pictures", work / "masks"
-    done = read_json(work / _DONE)
+    done = read_json(work / TAKEN)
     if done is None:
         for left in (folder, dark):
             shutil.rmtree(left, ignore_errors=True)
@@ -135,7 +137,7 @@ def take(
             done = _from_folder(folder, source, size, step)
         if source.masks is not None:
             _write_masks(dark, source.masks, done)
-        write_json(work / _DONE, done)
+        write_json(work / TAKEN, done)
     sizes = {name: tuple(size) for name, size in done["sizes"].items()}
     return Frames(folder, dark if source.masks else None, **done | {"sizes": sizes})
 
@@ -145,12 +147,15 @@ def _from_video(
 ) -> dict:
     """Write the sharpest frames, named after their numbers in the video, from 1."""
     with step("looking at frames") as progress:
-        stamps, sharpnesses, widths, speeds = measure(video, progress, threads)
+        stamps, sharpnesses, widths, speeds, are_new = measure(video, progress, threads)
     if len(stamps) < _MIN_IMAGES:
         got = f"{len(stamps)} frames"
         raise ValueError(f"{video}: expected a video of many frames, but got {got}; film longer")
-    count, why = frames_for(speeds) if count is None else (count, None)
-    chosen, times = sharpest(stamps, sharpnesses, count), {}
+    kept = np.flatnonzero(are_new) if are_new.sum() >= _MIN_IMAGES else np.arange(len(stamps))
+    count, why = frames_for(speeds[kept]) if count is None else (count, None)
+    if why and len(kept) < len(stamps):
+        why += f"; {len(stamps) - len(kept)} repeat the one before"
+    chosen, times = kept[sharpest(stamps[kept], sharpnesses[kept], count)].tolist(), {}
     transfer = hdr_of(video)
     mapped = f" ({_HDR[transfer]}, tone-mapped to SDR)" if transfer else ""
     with step(f"taking frames{mapped}") as progress:
@@ -179,13 +184,16 @@ def frames_for(speeds: np.ndarray) -> tuple[int, str]:
     (140, 'every frame of a short film')
     >>> frames_for(np.full(600, 2.0))
     (150, 'what is fast moves by 2 pixels of 640 a frame')
+    >>> frames_for(np.full(600, 0.5))
+    (120, 'what is fast moves by 0.5 pixels of 640 a frame; 120 at least')
     """
     found = len(speeds)
     if found <= _SHORT:
         return found, "every frame of a short film"
-    fast = min(_MOST, math.ceil(float(speeds.sum()) / _STEP))
-    count = min(found, max(fast, min(_ENOUGH, found // 2)))
-    return count, f"what is fast moves by {float(speeds.mean()):.2g} pixels of 640 a frame"
+    asked, least = math.ceil(float(speeds.sum()) / _STEP), min(_ENOUGH, found // 2)
+    count = min(found, _MOST, max(asked, least))
+    bound = "" if count == asked else f"; {count} at {'least' if asked < count else 'most'}"
+    return count, f"what is fast moves by {float(speeds.mean()):.2g} pixels of 640 a frame{bound}"
 
 
 def _from_folder(folder: Path, source: Source, size: int | None, step: Step) -> dict:
@@ -359,7 +367,7 @@ def speed(before: np.ndarray, grey: np.ndarray) -> float:
     True
     """
     scale = _FLOW / max(grey.shape)
-    size = max(8, round(scale * grey.shape[1])), max(8, round(scale * grey.shape[0]))
+    size = [max(_LEAST_SIDE, round(scale * length)) for length in grey.shape[::-1]]
     small = [cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in (before, grey)]
     flow = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_FAST).calc(*small, None)
     return float(np.quantile(np.hypot(flow[..., 0], flow[..., 1]), _FAST)) * 640 / _FLOW
@@ -403,9 +411,7 @@ def sharpest(stamps: np.ndarray, sharp: np.ndarray, count: int) -> list[int]:
     return [int(rows[np.argmax(sharp[rows])]) for rows in chosen]
 
 
-def measure(
-    video: Path, progress: Progress, threads: int | None = None
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def measure(video: Path, progress: Progress, threads: int | None = None) -> tuple[np.ndarray, ...]:
     """Decode a video once and measure its frames.
 
     Args:
@@ -414,21 +420,22 @@ def measure(
         threads: None: as many as ffmpeg likes.
 
     Returns:
-        seconds from the first frame (N,), ascending; ``sharpness`` (N,); ``edge_width`` (N,); and ``speed``
-        (N,), 0 of the first.
+        (N,) each: seconds from the first frame, ascending; ``sharpness``; ``edge_width``; ``speed``, 0 of the
+        first; and whether a frame does not repeat the one before, as films of another rate are converted.
 
     Raises:
         ValueError: where the file is no video, ends too early, or has a single frame.
 
-    **Cost** one decoding, and about 10 ms a frame.
+    **Cost** one decoding, and about 13 ms a frame.
     """
-    sharp, widths, speeds, before, log = [], [], [], None, _Log()
+    sharp, widths, speeds, are_new, before, log = [], [], [], [], None, _Log()
     long, short = (f"if(gt({a},{b}),{_MEASURED},-1)" for a, b in (("iw", "ih"), ("ih", "iw")))
     small = f"scale=w='min(iw,{long})':h='min(ih,{short})',format=gray"
     for image in _decode(video, f"showinfo=checksum=0,{small}", "pgm", log, threads):
         sharp.append(sharpness(image))
         widths.append(edge_width(image))
         speeds.append(0.0 if before is None else speed(before, image))
+        are_new.append(before is None or np.abs(image - before.astype(np.float32)).mean() >= _SAME)
         before = image
         if len(sharp) % 10 == 1 and log.duration and log.stamps:
             seconds = min(log.stamps[-1] - log.stamps[0], log.duration)
@@ -436,7 +443,7 @@ def measure(
     _refuse(video, log, len(sharp))
     progress(len(sharp), len(sharp))
     stamps = np.array(log.stamps[: len(sharp)])
-    return stamps - stamps[0], np.array(sharp), np.array(widths), np.array(speeds)
+    return stamps - stamps[0], np.array(sharp), np.array(widths), np.array(speeds), np.array(are_new)
 
 
 def extracted(

@@ -13,10 +13,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pycolmap
+import torch
 from filelock import FileLock, Timeout
 
 from forewarp.capture import poses, scene
-from forewarp.capture.frames import Frames, Source, Step, is_hidden, take
+from forewarp.capture.frames import TAKEN, Frames, Source, Step, is_hidden, take
 from forewarp.capture.poses import Reconstruction, Search, refuse_matches, refuse_poses
 from forewarp.data.images import read_image, write_image
 from forewarp.drawing.images import write_png
@@ -25,6 +26,7 @@ from forewarp.files import folder_written_whole, read_json, write_json
 ABOUT, PICTURE = "capture.json", "capture.png"  # in the scene's folder
 _BURNT = "burnt_in.png"  # in the work folder: dark where something is burnt into all images
 _ERROR = "error.json"  # pixels, before points were deleted
+_AGAIN = "of half as many too few had poses"
 _STATE = "about.json"  # what the work in a work folder depends on
 
 
@@ -58,6 +60,8 @@ def capture(
     about = {**dataclasses.asdict(source), **dataclasses.asdict(search), "frames": frames, "size": size}
     del about["threads"]
     cv2.setNumThreads(search.threads or -1)
+    if search.threads is not None:
+        torch.set_num_threads(search.threads)
     about["files"] = [_fingerprint(path) for path in (source.path, source.masks) if path is not None]
     with work_folder(out, about) as work:
         images = take(work, source, step, count=frames, size=size, threads=search.threads)
@@ -68,20 +72,20 @@ def capture(
                 found = find_poses(work, images, search, step, force)
             except poses.TooFewRegistered:
                 more = min(images.found, 2 * len(images.times))
-                if frames is not None or source.video is None or more == len(images.times):
+                again = frames is None and source.video is not None and images.why != _AGAIN
+                if not again or more == len(images.times):
                     raise
+                (work / TAKEN).unlink()  # first: without it frames are taken anew
                 for left in work.iterdir():
                     if left.name != _STATE:
                         shutil.rmtree(left) if left.is_dir() else left.unlink()
-                why = f"of {len(images.times)} frames too few had poses"
-                with step(f"once more: {why}") as progress:
-                    progress(1, 1)
-                images = take(work, source, step, count=more, size=size, threads=search.threads, why=why)
+                options = {"size": size, "threads": search.threads, "why": _AGAIN}
+                images = take(work, source, step, count=more, **options)
                 found = find_poses(work, images, search, step, force)
         refuse_poses(found, images)
         found = scene.placed(found)
         limits = scene.limits_of(found)
-        with step("what moves") as progress, folder_written_whole(out, ABOUT) as folder:
+        with step("what moves, writing") as progress, folder_written_whole(out, ABOUT) as folder:
             burnt = _burnt_in(work)
             written = scene.write(folder, source, images, found, limits, progress, burnt)
             if limits is not None:
@@ -178,7 +182,7 @@ def work_folder(out: Path, about: Mapping[str, object]) -> Iterator[Path]:
     except BaseException as error:
         # A refusal says what it got, unlike a bug, as a ``ValueError`` of NumPy's.
         is_refusal = isinstance(error, ValueError) and " but got " in str(error)
-        taken = (work / "pictures.json").exists()
+        taken = (work / TAKEN).exists()
         stays = taken or not (is_refusal or isinstance(error, ImportError))
         if is_refusal and taken:
             raise ValueError(

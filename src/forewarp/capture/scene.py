@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-from itertools import repeat
 from pathlib import Path
 
+import cv2
 import numpy as np
 import torch
 from torch import Tensor
@@ -129,7 +129,7 @@ def write(
     burnt: np.ndarray | None = None,
 ) -> tuple[list[int], float | None]:
     """Write the scene of all registered images, smaller copies of them, and masks of what moves: those that
-    were given, else those of ``motion.moving_masks``; none of several cameras.
+    were given, else those of ``motion.moving_masks``; none of several cameras, or where these cannot tell.
 
     Args:
         folder: to fill.
@@ -149,19 +149,29 @@ def write(
     has_alpha = common_header([frames.folder / name for name in names], one_size=False).has_alpha
     scales = [s for s in SCALES[1:] if shortest // s >= _MIN_SIDE]
     cameras, times = [found.cameras[name] for name in names], {frames.times[name] for name in names}
-    masks, share = repeat(None), 0.0
-    follows = len(times) == len(names) and len({(c.width, c.height) for c in cameras}) == 1
+    masks, moving_from, share = [None] * len(names), None, 0.0
     if frames.masks is not None:
+        moving_from = "the masks given"
         masks = (read_image(frames.masks / f"{name}.png")[..., 0].numpy() == 0 for name in names)
-    elif follows:
-        masks = moving_masks([frames.folder / name for name in names], cameras)
+    elif len(times) == len(names) and len({(c.width, c.height) for c in cameras}) == 1:
+        found_masks = []
+        for mask in moving_masks([frames.folder / name for name in names], cameras):
+            found_masks.append(mask)
+            progress(len(found_masks), 2 * len(names))
+        if 2 * sum(mask is not None for mask in found_masks) > len(names):
+            moving_from = "optical flow against the cameras"
+            nothing = np.zeros(next(mask.shape for mask in found_masks if mask is not None), bool)
+            masks = [nothing if mask is None else mask for mask in found_masks]
 
     def shots() -> Iterator[PosedShot]:
         nonlocal share
         for done, (name, moving) in enumerate(zip(names, masks), 1):
-            if moving is not None and burnt is not None:  # it moves against the world, but is none of it
-                moving = moving & ~burnt
-            share += 0.0 if moving is None else float(moving.mean()) / len(names)
+            if moving is not None:
+                size = cameras[done - 1].width, cameras[done - 1].height
+                moving = cv2.resize(moving.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
+                if burnt is not None:  # it moves against the world, but is none of it
+                    moving = moving & ~burnt
+                share += float(moving.mean()) / len(names)
             pixels = read_image(frames.folder / name).numpy()
             pixels = pixels if has_alpha else pixels[..., :3]
             for scale in scales:  # the mean of each block; what is left at the ends is left out
@@ -170,21 +180,22 @@ def write(
                 write_image(folder / f"images_{scale}" / name, small)
             time = (frames.times[name] - first) / (last - first) if last > first else 0.0
             yield PosedShot(name, found.cameras[name], pixels, time, moving=moving)
-            progress(done, len(names))
+            progress(len(names) + done, 2 * len(names))
 
     options = {"near": limits.near, "far": limits.far, "aabb": limits.box} if limits else {}
-    if frames.masks is not None or follows:
-        options["moving_from"] = "the masks given" if frames.masks else "optical flow against the cameras"
+    if moving_from is not None:
+        options["moving_from"] = moving_from
     if source.video is not None:
         options["seconds"] = last - first
     if burnt is not None:
         options["mask"] = MASK
         for scale in (1, *scales):
-            height, width = (n // scale * scale for n in burnt.shape)
-            small = np.where(burnt[:height:scale, :width:scale], 0, 255).astype(np.uint8)
+            height, width = (n // scale for n in burnt.shape)
+            blocks = burnt[: height * scale, : width * scale].reshape(height, scale, width, scale)
+            small = np.where(blocks.any((1, 3)), 0, 255).astype(np.uint8)
             write_image(folder / (MASK if scale == 1 else MASK.replace("/", f"_{scale}/")), small)
     write_scene(folder, shots(), points=found.sure(), **options)
-    return scales, share if "moving_from" in options else None
+    return scales, None if moving_from is None else share
 
 
 def draw(found: Reconstruction, limits: Limits) -> Tensor:

@@ -109,7 +109,7 @@ def check(config) -> tuple[dict, object]:
             )
         if ours and key in ("images", "masks") and place.is_relative_to(ours):
             raise ValueError(
-                f"out: expected a folder outside {key}={path}, whose files it reads, but got {out}"
+                f"out: expected a folder outside {key}={path}, which is read, but got {out}; set out=..."
             )
     if (out / MARKERS["posed_video"]).exists() and not config.overwrite:
         raise ValueError(f"{out}: expected a new folder, but got a scene; set overwrite=true or out=...")

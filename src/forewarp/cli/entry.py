@@ -173,7 +173,7 @@ def _bug(error: Exception) -> str:
 
 def choices(conf: Path, name: str) -> str:
     """List the options of every group that ``<name>.yaml`` uses, for the help."""
-    from forewarp.runs.config_files import option_groups
+    from forewarp.runs.sections import option_groups
 
     groups = option_groups(conf)
     if name == "train":

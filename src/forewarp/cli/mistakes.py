@@ -20,15 +20,22 @@ FOLDERS = {"evaluate": "run", "render": "run", "view": "run", "export": "run", "
 
 
 def with_run_key(name: str, arguments: list[str]) -> list[str]:
-    """Put ``run=`` (for ``train``: ``resume=``) before a bare folder, whose name may hold ``=``.
+    """Put ``run=`` (for ``train``: ``resume=``) before a bare folder. One whose name reads as an override, as
+    Hydra names those of a sweep, needs its path: ``./seed=0``, ``runs/seed=0``.
 
     Args:
         name: name of the command.
         arguments: arguments of the command line.
     """
     key, before = FOLDERS.get(name), ["", *arguments]
+    reads_as_override = re.compile(r"[~+]|[^/]*=")
     bare = [
-        key and one[:1] != "-" and before[i][:1] != "-" and one != "" and Path(one).is_dir()
+        key
+        and one
+        and not one.startswith("-")
+        and not before[i].startswith("-")
+        and not reads_as_override.match(one)
+        and Path(one).is_dir()
         for i, one in enumerate(arguments)
     ]
     return [f"{key}={one}" if is_bare else one for is_bare, one in zip(bare, arguments)]
@@ -58,7 +65,7 @@ def unknown_key(error: Exception, name: str, arguments: list[str]) -> str | None
     """
     from hydra.errors import HydraException
 
-    from forewarp.runs.config_files import option_groups
+    from forewarp.runs.sections import option_groups
 
     unknown = re.match(r"Could not override '([^'@]+)'", str(error))
     if unknown is None or not isinstance(error, HydraException):

@@ -1,4 +1,4 @@
-"""A fitted run: open it as an object, measure it, and score it for a sweep."""
+"""A fitted run: open it as an object, measure it, score it for a sweep, and say what speaks against it."""
 
 from __future__ import annotations
 

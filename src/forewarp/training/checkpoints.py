@@ -1,4 +1,5 @@
-"""Checkpoints of a stage: written whole or not at all, read safely, refused if they do not fit.
+"""What a stage leaves in its folder: checkpoints, written whole or not at all, read safely, and refused if
+they do not fit; and the handover to the next stage.
 
 Lightning makes and restores their content. ``KeepCheckpoint`` stands in for its ``ModelCheckpoint``, which
 moves the file from the temporary folder, perhaps another disk, without syncing it, and counts wall time.

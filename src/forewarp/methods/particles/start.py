@@ -4,6 +4,7 @@ kernels compiled ahead.
 
 from __future__ import annotations
 
+import math
 import subprocess
 import sys
 from collections.abc import Callable, Iterator, Sequence
@@ -43,6 +44,7 @@ _FEW = 16  # points that are too few to begin with
 _CAMERAS = 64  # whose distance from a point is looked at
 
 _DEPTHS = 48  # planes of a sweep, evenly in inverse depth
+_WHOLLY = 0.999  # share of a pixel from which on all of it is learned from
 _SIDE = 64  # lattice points along the longer side of an image
 _SWEPT, _NEIGHBOURS = 10, 8  # images that are swept; neighbours in time of each
 _NEAREST_PLANE = 0.02  # share of the far plane at which planes begin at the earliest
@@ -193,15 +195,17 @@ def swept(scene: Scene, frames: list[int], count: int) -> Cloud | None:
     points, colors = torch.cat(points), torch.cat(colors)
     if not len(points):
         return None
-    return Cloud(points, colors, torch.full((len(points),), 0.5), float(torch.stack(sizes).nanmedian()))
+    size = float(torch.stack(sizes).nanmedian())  # none where known points fill all cells
+    size = scene.box.diagonal / side if math.isnan(size) else size
+    return Cloud(points, colors, torch.full((len(points),), 0.5), size)
 
 
 _Small = Callable[[int], tuple[Tensor, Tensor, Camera]]  # an image's number -> see ``_small``
 
 
 def _small(frames: Sequence[Frame], side: int, i: int) -> tuple[Tensor, Tensor, Camera]:
-    """Return an image (h, w, 3) whose longer side is about four times the lattice's, the share of each of its
-    pixels that is learned from (h, w), and its camera, whose lens is undone: it would be, for every plane.
+    """Return an image (h, w, 3) whose longer side is about four times the lattice's; which of its pixels the
+    photo has and are learned from (h, w); and its camera. Its lens is undone: it would be, for every plane.
     """
     frame, camera = frames[i], frames[i].camera
     scale = min(1.0, 4 * side / max(camera.width, camera.height))
@@ -210,14 +214,14 @@ def _small(frames: Sequence[Frame], side: int, i: int) -> tuple[Tensor, Tensor, 
     planes = [frame.load()[..., :3].float() / 255] + ([] if valid is None else [valid])
     planes = torch.cat([plane.permute(2, 0, 1)[None] for plane in planes], 1)
     planes = torch.nn.functional.interpolate(planes, size, mode="area")
-    camera = camera.resized(size[1], size[0])
+    camera, inside = camera.resized(size[1], size[0]), torch.ones(size, dtype=torch.bool)
     if camera.lens is not None:
         inner = camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy, camera.skew
         places = _bent_pixels(*inner, camera.lens)
         planes = torch.nn.functional.grid_sample(planes, places, padding_mode="border", align_corners=False)
-        camera = replace(camera, lens=None)
-    rgb = planes[0, :3].permute(1, 2, 0).contiguous()
-    return rgb, torch.ones(size) if valid is None else planes[0, 3], camera
+        camera, inside = replace(camera, lens=None), (places[0].abs() <= 1).all(-1)
+    learned = inside if valid is None else inside & (planes[0, 3] > _WHOLLY)
+    return planes[0, :3].permute(1, 2, 0).contiguous(), learned, camera
 
 
 @lru_cache(maxsize=8)
@@ -246,7 +250,7 @@ def _sweep(scene: Scene, i: int, side: int, small: _Small, before: Tensor) -> tu
     rows, columns = rows.flatten(), columns.flatten()
     rays = camera.rays(rows * camera.width + columns)
     swept = _in_holes(before, rays.origins + rays.directions, camera, side)
-    swept &= valid[rows, columns] == 1  # what is not learned from is no start either
+    swept &= valid[rows, columns]  # what is not learned from is no start either
     rays, color = rays[swept], rgb[rows[swept], columns[swept]]
     time = scene.train[i].time
     neighbours = sorted(
@@ -276,7 +280,7 @@ def _nearest_plane(camera: Camera, neighbours: Sequence[Camera]) -> float:
 def _difference(points: Tensor, color: Tensor, rgb: Tensor, valid: Tensor, camera: Camera) -> Tensor:
     """Return how unlike another image is (P, D) at points (P, D, 3); 1 where it does not show them."""
     inside, row, column = _pixels(camera, points)
-    return torch.where(inside, (rgb[row, column] - color[:, None]).abs().mean(-1), 1.0)
+    return torch.where(inside & valid[row, column], (rgb[row, column] - color[:, None]).abs().mean(-1), 1.0)
 
 
 def _pixels(camera: Camera, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
