@@ -52,7 +52,7 @@ def synthetic(outside):
     return {"_target_": target, "root": str(outside), "scene": "new", "synthesis": {}}
 
 
-KINDS = {  # what is wrong with the folder -> how it is made, what the refusal names, and who is quick to open it
+KINDS = {  # what is wrong with the folder -> how it is made, what the refusal names, who is quick to open it
     "planned": (within("planned", lambda outside: f"{outside}/secret"), None, ["train"]),
     "callback": (within("callbacks.x", keeper), "callbacks.x._target_", ["train", "export", "report"]),
     "logger": (within("logger.log_dir", lambda outside: str(outside)), "logger.log_dir", ["evaluate"]),
