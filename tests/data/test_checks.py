@@ -121,7 +121,7 @@ def test_masks_that_leave_little_are_told(tmp_path):
 def ball(premultiplied, brightness=200, size=64):
     """A ball whose edge is soft, uint8 (H, W, 4)."""
     row, column = np.mgrid[:size, :size] - size / 2 + 0.5
-    alpha = np.clip(20 - np.hypot(row, column) + 0.5, 0, 1)[..., None] ** 0.5
+    alpha = np.clip(20 / 64 * size - np.hypot(row, column) + 0.5, 0, 1)[..., None] ** 0.5
     rgb = np.full((size, size, 3), brightness) * np.where(alpha > 0, 1, 0) * (alpha if premultiplied else 1)
     return np.rint(np.concatenate([rgb, 255 * alpha], -1)).astype(np.uint8)
 
@@ -153,14 +153,75 @@ def test_premultiplied_colours_are_recognised_by_edges(read, tmp_path):
         reader(tmp_path, "toy", alpha="associated")
 
 
-def test_straight_dark_and_opaque_images_are_left_as_they_are():
-    images = {
-        name: torch.from_numpy(ball(*of)) for name, of in {"straight": (False,), "dark": (False, 20)}.items()
-    }
-    assert not any(is_premultiplied([image] * 4) for image in images.values())
-    assert not is_premultiplied([torch.full((8, 8, 4), 255, dtype=torch.uint8)])
-    assert is_premultiplied([torch.from_numpy(ball(True))] * 4)
-    assert torch.equal(straight(images["straight"])[32, 32], images["straight"][32, 32])
+def over(rgba, color, alpha):
+    """Straight RGBA (H, W, 4) over one colour whose alpha is (H, W), 0 to 255."""
+    front, behind = rgba[..., 3:] / 255, np.rint(alpha)[..., None] / 255 * (1 - rgba[..., 3:] / 255)
+    whole = front + behind
+    rgb = (rgba[..., :3] * front + np.array(color) * behind) / np.where(whole > 0, whole, 1)
+    return np.rint(np.concatenate([rgb, 255 * whole], -1)).astype(np.uint8)
+
+
+def disk(size, radius, soft=1.0):
+    """A disk in the middle that fades over ``soft`` pixels, (H, W), 0 to 1."""
+    row, column = np.mgrid[:size, :size] - size / 2 + 0.5
+    return np.clip((radius - np.hypot(row, column)) / soft + 0.5, 0, 1)
+
+
+def shadowed(size, color=0):
+    """A bright ball before a soft shadow, as Blender's shadow catcher makes it."""
+    shadow = np.roll(150 * disk(size, 0.2 * size, 0.3 * size), size // 4, 0)
+    return over(ball(False, size=size), [color] * 3, shadow)
+
+
+def toon(size=200):
+    """A bright coat and a body that lets light through, both behind an outline whose edge is soft."""
+    image = np.zeros((size, size, 4), np.uint8)
+    image[disk(size, 85) > 0] = [0, 0, 0, 255]
+    image[..., 3] = np.rint(255 * disk(size, 85, 4))
+    image[disk(size, 80) > 0.5] = [150, 150, 150, 180]
+    image[disk(size, 55) > 0.5] = [220, 220, 220, 255]
+    return image
+
+
+def pane(size=200):
+    """A pane of glass before a soft shadow, beside a bright ball."""
+    image = shadowed(size)
+    image[20:60, 20:180] = (120, 110, 100, 170)
+    return image
+
+
+def multiplied(rgba):
+    """Multiply straight colours by alpha, uint8 (H, W, 4)."""
+    return np.rint(np.concatenate([rgba[..., :3] * (rgba[..., 3:] / 255), rgba[..., 3:]], -1)).astype(
+        np.uint8
+    )
+
+
+@pytest.mark.parametrize(
+    "image",
+    [
+        *(shadowed(size, color) for size in (200, 400, 800) for color in (0, 3, 12)),
+        toon(),
+        pane(400),
+        ball(False),
+        ball(False, 60, 400),
+        np.full((8, 8, 4), 255, np.uint8),
+    ],
+)
+def test_straight_colours_are_left_as_they_are(image):
+    assert not is_premultiplied([torch.from_numpy(image)] * 4)
+
+
+@pytest.mark.parametrize(
+    "image", [ball(True), ball(True, 100, 800), *(multiplied(shadowed(*of)) for of in ((200,), (400, 3)))]
+)
+def test_premultiplied_colours_are_divided_by_alpha(image):
+    image = torch.from_numpy(image)
+    assert is_premultiplied([image] * 4)
+    divided, solid = straight(image), image[..., 3] == 255
+    assert torch.equal(divided[solid], image[solid])
+    faint = (image[..., 3] < 200) & (image[..., :3].amax(-1) > 4)
+    assert bool((divided[faint][:, :3].amax(-1) > image[faint][:, :3].amax(-1)).all())
 
 
 def test_smoke_is_a_subject_and_one_that_comes_late_is_only_told(tmp_path):

@@ -30,7 +30,7 @@ _MOST_PIXELS = 80_000_000  # Pillow warns a little above
 _ORIENTATION = 0x0112  # EXIF's tag
 _JPEG_END, _JPEG_TAIL = b"\xff\xd9", 4096  # some cameras write a little behind the end
 _LEAST_HIDDEN, _COLORS = 0.01, 64  # share of an image, and colours, that tell an image beneath
-_ROUNDED, _STRAY, _LEAST_EDGES, _EDGES_OF = 2, 0.01, 50, 4  # of an edge; share, least edges, images
+_ROUNDED, _STRAY, _LEAST_EDGES, _EDGES_OF = 2, 0.001, 50, 4  # of an edge; share, least edges, images
 _FOREGROUND = 127  # a mask above it is foreground; masks are lossy, so never quite 0 or 255
 
 
@@ -221,8 +221,9 @@ def straight(rgba: Tensor) -> Tensor:
 def is_premultiplied(images: Iterable[Tensor]) -> bool:
     """Tell whether colours of images (H, W, 4) are multiplied by alpha: no edge is brighter than its alpha.
 
-    Of straight alpha edges are about as bright as what they are of. Those that would be too bright for their
-    alpha, were they half as bright, are counted; there must be some.
+    Of straight alpha edges are about as bright as what they are of. Only those tell whose colour, divided by
+    alpha, would be at least half as bright as what is opaque: black shadows and outlines are below every
+    alpha. There must be some, and next to no pixel of any alpha may be brighter than it.
     """
     brightest, alpha = [], []
     for rgba in images:
@@ -232,9 +233,11 @@ def is_premultiplied(images: Iterable[Tensor]) -> bool:
     solid = brightest[alpha == 255]
     if not len(solid):
         return False
-    telling = (alpha > 0) & (2 * alpha < solid.median())
-    above = int((brightest[telling] > alpha[telling] + _ROUNDED).sum())
-    return int(telling.sum()) >= _LEAST_EDGES and above <= _STRAY * int(telling.sum())
+    middle, soft = int(solid.median()), (alpha > 0) & (alpha < 255)
+    is_lit = (brightest > 2 * _ROUNDED) & (2 * 255 * brightest >= middle * alpha)
+    telling = int((soft & is_lit & (2 * alpha < middle)).sum())
+    above = int((soft & (brightest > alpha + _ROUNDED)).sum())
+    return telling >= _LEAST_EDGES and above <= _STRAY * telling
 
 
 def alpha_of(alpha: str | None, paths: Sequence[Path], where: object) -> tuple[bool, list[str]]:
