@@ -13,7 +13,14 @@ from forewarp.data.cameras import FLIP
 from forewarp.data.checks import check_seen
 from forewarp.data.files import Entry, SceneError, layout_of
 from forewarp.data.module import DNeRFDataModule
-from forewarp.data.transforms import camera_of, check_directions, left_aside, looks_turned, times_of
+from forewarp.data.transforms import (
+    camera_of,
+    check_directions,
+    check_times,
+    left_aside,
+    looks_turned,
+    times_of,
+)
 from forewarp.scene.camera import look_at
 from tests.support.written_scenes import dnerf_shots, edit, write_dnerf
 
@@ -74,6 +81,15 @@ def test_a_vertical_angle_that_contradicts_is_told(angle, said, tmp_path):
     assert all(
         "camera_angle_y: 53.1 degrees left aside, as the other keys say 41.1" in line for line in lines
     )
+
+
+@pytest.mark.parametrize("angle", [41.0, "41", True, [1], 0, 10**400])
+def test_a_vertical_angle_that_is_none_is_told_and_never_refused(angle):
+    entry = Entry("t.json", {"fl_x": 80}, common={"camera_angle_y": angle})
+    assert left_aside([(entry, camera(**entry.own))]) == []  # a frame's own number wins
+    entry = Entry("t.json", {}, common={"fl_x": 80, "camera_angle_y": angle})
+    (line,) = left_aside([(entry, camera(fl_x=80))])
+    assert ", no radians inside (0, pi), left aside, as the other keys say 41.1 degrees; write fl_y" in line
 
 
 @pytest.mark.parametrize(
@@ -185,6 +201,56 @@ def test_times_in_any_unit_and_matrices_of_three_rows(tmp_path):
     assert scene.protocol["assumed"] == [f"{folder}: all times lie from 3000 to 3040: taken as 0 to 1"]
     for frame, other in zip(scene.train, expected.train):
         assert torch.equal(frame.camera.camera_to_world, other.camera.camera_to_world)
+
+
+def test_times_that_miss_0_and_1_by_rounding_are_not_scaled():
+    names = ["a", "b", "c"]
+    assert times_of(names, [-1e-17, 0.5, 1.0000000000000002], "t.json") == ([0, 0.5, 1], None)
+    assert "0 to 1.01: taken as" in times_of(names, [0, 0.5, 1.01], "t.json")[1]
+
+
+@pytest.mark.parametrize(
+    ("train", "test", "said"),
+    [
+        (
+            [0, 0.5, 33.3, 0.7],
+            [1],
+            r"t.json: time of train/2: expected a time near all others, 0 to 1, .* 33.3;",
+        ),
+        (
+            [0, *(1000 + i for i in range(19))],
+            [1000.5],
+            "time of train/0: expected .* 1000 to 101., but got 0",
+        ),
+        ([i / 18 for i in range(19)], [44.0, 55.0], "time of test/1: expected .* 0 to 1, but got 55"),
+        (
+            [0, 0.5, 1],
+            [0, 50, 100],
+            r"times of train frames: expected one .* 0 to 100, .* 0 to 1 \(train/0, ..",
+        ),
+        ([0, 50, 100], [0, 0.5, 1], "times of test frames: expected one unit .* write all times in one unit"),
+    ],
+)
+def test_times_in_two_units_are_refused(train, test, said):
+    times = {"train": train, "test": test}
+    with pytest.raises(SceneError, match=said):
+        check_times({k: {f"{k}/{i}": t for i, t in enumerate(of)} for k, of in times.items()}, "t.json")
+
+
+@pytest.mark.parametrize(
+    ("train", "test"),
+    [
+        ([0, 0.01, 0.02, 1], [0.5]),  # as they are
+        ([0, 1000], [0, 1]),
+        ([None, None], [None]),
+        (range(0, 3000, 33), [2901, 2934, 2967]),  # the last moments are tested on
+        ([7, 7, 7], [0, 100]),
+        ([0, 0.5, 1, 1.5, 3], [2]),
+    ],
+)
+def test_times_in_one_unit_are_not_refused(train, test):
+    times = {"train": train, "test": test}
+    check_times({k: {f"{k}/{i}": t for i, t in enumerate(of)} for k, of in times.items()}, "t.json")
 
 
 def test_what_is_not_there_is_left_out_and_told(tmp_path):

@@ -18,6 +18,7 @@ import os
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import islice
 from pathlib import Path
 from reprlib import repr as short
 
@@ -40,6 +41,7 @@ from forewarp.data.transforms import (
     camera_of,
     check_axes,
     check_directions,
+    check_times,
     hold_out_every,
     left_aside,
     pose_in,
@@ -235,8 +237,11 @@ def _read_records(
         assumed += [line for _, lines in found for line in lines]
     everything = [record for split in SPLITS for record in records[split]]
     names = [record.image.relative_to(folder).with_suffix("").as_posix() for record in everything]
-    times, told = times_of(names, [record.time for record in everything], str(folder))
+    given = [record.time for record in everything]
+    times, told = times_of(names, given, str(folder))
     assumed += [told] if told else []
+    pairs = iter(zip(names, given))
+    check_times({split: dict(islice(pairs, len(records[split]))) for split in SPLITS}, str(folder))
     timed = iter(replace(record, time=time) for record, time in zip(everything, times))
     records = {split: [next(timed) for _ in records[split]] for split in SPLITS}
     if not records["test"]:

@@ -40,6 +40,7 @@ from forewarp.data.transforms import (
     camera_of,
     check_axes,
     check_directions,
+    check_times,
     hold_out_every,
     left_aside,
     pose_in,
@@ -138,9 +139,11 @@ def read_scene(
     for load in cut_out:  # none is decoded yet
         load.premultiplied = premultiplied
     times, told = times_of([entry.name for entry in entries], [entry.time for entry in entries], str(file))
+    given = {entry.name: entry.time for entry in entries}
     entries = [replace(entry, time=time) for entry, time in zip(entries, times)]
     entries.sort(key=lambda entry: entry.time)
     parts, how = _split_entries(file, content, entries, test_every, absent)
+    check_times({split: {e.name: given[e.name] for e in part} for split, part in parts.items()}, str(file))
     near, far = (_length(file, content, key, value) for key, value in (("near", near), ("far", far)))
     bounds = _bounds(file, content, box)
     shown = (e for e in entries if e.load.mask or (e.has_alpha and bool((e.load()[..., 3] < 255).any())))

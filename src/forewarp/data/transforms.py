@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import os
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from reprlib import repr as short
 from typing import TypeVar
@@ -28,12 +28,14 @@ MODELS = ("OPENCV", "PINHOLE", "RADIAL", "SIMPLE_RADIAL", "SIMPLE_PINHOLE")
 AXES = ("opengl", "opencv")
 # Keys of instant-ngp that say that the lens is none of these, whatever k1 .. say.
 _OTHER_LENSES = ("is_fisheye", "ftheta_p0", "latlong", "equirectangular")
+_FOCAL = ("fl_x", "fl_y", "camera_angle_x")
 _SAME_FOCAL = 0.02  # share by which two focal lengths of one camera may differ
 _OUTSIDE = 0.9  # share of a side beyond which a principal point is another image's
 _LEAST_CAMERAS = 4  # of which can be told whether they look at something in common
 _ALL = 0.9  # share of cameras before which a common point must lie
 _MOST_TIME = 1e20
-_LEAST_SPAN = 0.05  # of all times: less is hardly what was meant
+_LEAST_SPAN, _MOST_FAR = 0.05, 0.1  # of all times: less is hardly what was meant; share that may be wrong
+_ROUNDING = 1e-6  # beyond 0 and 1
 _MEET, _MISS = 0.15, 0.5  # miss of the axes in shares of the distance: they meet in a point, they do not
 _CAMERA_WORDS = re.compile(r"(cam|camera|view|sensor|c|v)[_-]?$", re.IGNORECASE)
 
@@ -123,18 +125,22 @@ def _focal(entry: Entry, width: int, height: int, longer: bool) -> float:
 
 
 def left_aside(cameras: Iterable[tuple[Entry, Camera]]) -> list[str]:
-    """Say in a line where ``camera_angle_y`` is another angle than the camera's, as of some add-ons'."""
+    """Say in a line where ``camera_angle_y`` is another angle than the camera's, or no angle.
+
+    One at the top says nothing of frames with a focal length or angle of their own.
+    """
     for entry, camera in cameras:
-        if entry.get("camera_angle_y") is None:
+        told, is_own = entry.get("camera_angle_y"), "camera_angle_y" in entry.own
+        if told is None or (not is_own and any(key in entry.own for key in _FOCAL)):
             continue
-        told, angle = (
-            entry.number("camera_angle_y", 0, math.pi),
-            2 * math.atan(0.5 * camera.height / camera.fy),
-        )
-        if abs(math.tan(0.5 * told) / math.tan(0.5 * angle) - 1) > _SAME_FOCAL:
-            degrees = f"{math.degrees(told):.1f} degrees"
-            said = f"left aside, as the other keys say {math.degrees(angle):.1f}"
-            return [f"{entry.where('camera_angle_y')}: {degrees} {said}; write fl_y if they are wrong"]
+        angle = 2 * math.atan(0.5 * camera.height / camera.fy)
+        got = f"{short(told)}, no radians inside (0, pi),"
+        if isinstance(told, (int, float)) and not isinstance(told, bool) and 0 < told < math.pi:
+            if abs(math.tan(0.5 * told) / math.tan(0.5 * angle) - 1) <= _SAME_FOCAL:
+                continue
+            got = f"{math.degrees(told):.1f} degrees"
+        said = f"{got} left aside, as the other keys say {math.degrees(angle):.1f} degrees"
+        return [f"{entry.where('camera_angle_y')}: {said}; write fl_y if they are wrong"]
     return []
 
 
@@ -330,11 +336,12 @@ def times_of(
     if all(given):
         first, last = min(times), max(times)
         span = f"{where}: all times lie from {first:.10g} to {last:.10g}"
-        if first < 0 or last > 1:
+        if not _within_unit(times):
             length, taken = last - first, "taken as 0 to 1" if last > first else "taken as one moment"
             return [(time - first) / (length or 1) for time in times], f"{span}: {taken}"
         line = f"{span}, where 0 to 1 is the whole sequence"
-        return list(times), line if len(times) > 1 and last - first < _LEAST_SPAN else None
+        times = [min(max(time, 0.0), 1.0) for time in times]
+        return times, line if len(times) > 1 and last - first < _LEAST_SPAN else None
     if any(given):
         got = f"{sum(given)} of {len(given)}, and none for {names[given.index(False)]}"
         raise mismatch(f"{where}: frames: time", "one in all frames or in none", got)
@@ -350,6 +357,47 @@ def times_of(
     if len(set(numbers)) < len(numbers):
         line += "; images of one number share a time"
     return [(number - first) / max(last - first, 1) for number in numbers], line
+
+
+def check_times(splits: Mapping[str, Mapping[str, float | None]], where: str) -> None:
+    """Refuse times in two units, or a few far from all others: ``times_of`` would squeeze the rest.
+
+    Args:
+        splits: of each split the frames' names and what the file says of their times.
+        where: the file, for errors.
+
+    Raises:
+        SceneError: naming a frame, where times are to be scaled to [0, 1] and three or more would span next
+            to nothing: all but the farthest, those of training, or a split's that lie in [0, 1].
+    """
+    named = {name: time for times in splits.values() for name, time in times.items()}
+    if None in named.values() or _within_unit(named.values()):
+        return
+    times = sorted({*named.values()})
+    least = _LEAST_SPAN * (times[-1] - times[0])
+    advice = "write all times in one unit, or from 0 to 1"
+
+    def is_squeezed(some: Iterable[float]) -> bool:
+        return len({*some}) > 2 and max(some) - min(some) < least
+
+    middle = times[len(times) // 2]
+    *rest, far = sorted(times, key=lambda time: abs(time - middle))
+    rest = rest[: len(times) - max(1, int(_MOST_FAR * len(times)))]
+    if is_squeezed(rest):
+        name = next(name for name, time in named.items() if time == far)
+        expected = f"a time near all others, {min(rest):.10g} to {max(rest):.10g}"
+        raise mismatch(f"{where}: time of {name}", expected, f"{far:.10g}", advice)
+    for split, of in splits.items():
+        some = of.values()
+        if is_squeezed(some) and (split == "train" or _within_unit(some)):
+            expected = f"one unit in all splits, which have {times[0]:.10g} to {times[-1]:.10g}"
+            got = f"{min(some):.10g} to {max(some):.10g} ({next(iter(of))}, ..)"
+            raise mismatch(f"{where}: times of {split} frames", expected, got, advice)
+
+
+def _within_unit(times: Iterable[float]) -> bool:
+    """Tell whether all times lie in [0, 1], but for rounding."""
+    return all(-_ROUNDING <= time <= 1 + _ROUNDING for time in times)
 
 
 def _numbers(names: Sequence[str]) -> list[int] | None:
