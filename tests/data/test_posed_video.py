@@ -386,6 +386,15 @@ def test_masks_of_what_moves_are_of_all_frames_and_of_the_images_size(tmp_path, 
         read_scene(tmp_path, "toy")
 
 
+def test_a_key_that_is_null_is_absent(tmp_path, made):
+    made()
+    expected = read_scene(tmp_path, "toy").protocol
+    top = ("seconds", "moving_from", "ply_file_path", "camera_angle_y", "test_filenames", "aabb", "k4")
+    own = [f"frames.{i}.{key}" for i in range(10) for key in ("moving_path", "mask_path", "fl_x", "time")]
+    edit(tmp_path / "toy" / FILE, dict.fromkeys([*top, *own]))
+    assert read_scene(tmp_path, "toy").protocol == expected
+
+
 def test_masks_that_cannot_be_meant_are_refused(tmp_path, masked):
     masked(100)
     with pytest.raises(SceneError, match=r"m_0.png: expected a mask with a bright pixel.*none above 127"):

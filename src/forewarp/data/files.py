@@ -193,8 +193,13 @@ class Entry:
         return inside(self.file.parent, self.get(key), self.where(key))
 
 
+def stated(content: Mapping) -> dict:
+    """Leave out keys whose value is null: they say nothing."""
+    return {key: value for key, value in content.items() if value is not None}
+
+
 def frames_of(file: Path, content: dict, common: Mapping) -> list[Entry]:
-    """Check the list ``frames`` of a file, which has from one to a million objects.
+    """Check the list ``frames`` of a file, which has from one to a million objects; null counts as absent.
 
     Args:
         file: for errors.
@@ -209,7 +214,8 @@ def frames_of(file: Path, content: dict, common: Mapping) -> list[Entry]:
     for i, frame in enumerate(frames):
         if not isinstance(frame, dict):
             raise mismatch(f"{where}[{i}]", "an object", short(frame))
-    return [Entry(file, frame, f"frames[{i}].", common) for i, frame in enumerate(frames)]
+    common = stated(common)
+    return [Entry(file, stated(frame), f"frames[{i}].", common) for i, frame in enumerate(frames)]
 
 
 def scene_folder(root: str | Path, scene: str, reader: str) -> Path:

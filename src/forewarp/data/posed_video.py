@@ -23,7 +23,17 @@ from torch import Tensor
 
 from forewarp.data.arrays import read_cloud, write_array
 from forewarp.data.cameras import MOST_UNITS, SPLITS, box_of, opengl_rows, space_of
-from forewarp.data.files import frames_of, inside, mismatch, number, read_json, remove, scene_folder, whole
+from forewarp.data.files import (
+    frames_of,
+    inside,
+    mismatch,
+    number,
+    read_json,
+    remove,
+    scene_folder,
+    stated,
+    whole,
+)
 from forewarp.data.images import (
     SUFFIXES,
     MovingMask,
@@ -131,7 +141,7 @@ def read_scene(
     if not isinstance(normalise, bool):
         raise mismatch("data.normalise", "true or false", repr(normalise))
     file = scene_folder(root, scene, "posed_video") / FILE
-    content = read_json(file)
+    content = stated(read_json(file))
     entries, absent, assumed = _read_entries(file, content, scale, axes, inverse, masks)
     cut_out = [entry.load for entry in entries if entry.has_alpha]
     premultiplied, told = alpha_of(alpha, [load.path for load in cut_out], file)
@@ -167,6 +177,8 @@ def read_scene(
         )
         for split in SPLITS
     )
+    if not isinstance(moving_from := content.get("moving_from", "moving_path of the frames"), str):
+        raise mismatch(f"{file}: moving_from", "text", short(moving_from))
     start = (min if canonical == "first" else middle_of)([frame.time for frame in train])
     protocol = {
         "dataset": "video_with_poses",
@@ -184,7 +196,7 @@ def read_scene(
             "ignore: PSNR is of the pixels that count, other metrics see the true colour elsewhere"
         )
     if train[0].load_moving is not None:
-        protocol["moving"] = str(content.get("moving_from", "moving_path of the frames"))
+        protocol["moving"] = moving_from
     if "seconds" in content:
         protocol["seconds"] = number(content["seconds"], f"{file}: seconds", 0, 1e9)
     cloud = _points_of(file, content)
