@@ -48,8 +48,15 @@ def with_alpha(change):
     return of
 
 
-def test_what_fits_together_is_not_doubted():
+def test_what_fits_together_is_not_doubted(tmp_path):
     assert list(remarks(SCENE)) == []
+    points = torch.rand(200, 3, generator=torch.Generator().manual_seed(0)) - 0.5  # an orbit around them
+    assert list(remarks(changed(still=points))) == []
+    write_video(tmp_path / "toy", near=20.0, far=120.0)
+    np.save(tmp_path / "toy" / "points.npy", MIDDLE.numpy() + 5 * points.numpy())
+    scene = posed_video.read_scene(tmp_path, "toy")
+    assert (scene.protocol["derived"], len(scene.still)) == (["box"], 200)
+    assert list(remarks(scene)) == []
 
 
 @pytest.mark.parametrize(
