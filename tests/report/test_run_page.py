@@ -419,7 +419,7 @@ def test_a_run_keeps_its_trainer_unless_one_is_named(ok, run, tmp_path, monkeypa
     ("arguments", "line"),
     [
         ([], "run: expected the folder of a run, but got nothing; set run=runs/..."),
-        (["run=[a,b]"], "run: expected the folder of one run, but got 2"),
+        (["run=[a,b]"], "[a,b]/config.yaml: expected the configuration of a run, but got none"),
         (["runs=a"], "run: expected the folder of a run, but got runs=; set run=<a run's folder>"),
         (["run=nowhere"], "nowhere/config.yaml: expected the configuration of a run, but got none"),
         (["run=several"], "but got several, which holds 2; choose one: several/ball/base-1.0-seed0, "),

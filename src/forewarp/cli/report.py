@@ -42,7 +42,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import NamedTuple
 
-from omegaconf import DictConfig, ListConfig, OmegaConf
+from omegaconf import DictConfig, OmegaConf
 
 from forewarp.cli.entry import command
 from forewarp.cli.mistakes import one_line
@@ -184,11 +184,6 @@ def _named(config: DictConfig) -> Path:
     if config.run is None:
         got, folder = ("runs=", "<a run's folder>") if config.runs is not None else ("nothing", "runs/...")
         raise ValueError(f"run: expected the folder of a run, but got {got}; set run={folder}")
-    if isinstance(config.run, ListConfig):
-        raise ValueError(
-            f"run: expected the folder of one run, but got {len(config.run)}; a page shows one run, and "
-            "kind=compare several"
-        )
     return Path(str(config.run))
 
 
