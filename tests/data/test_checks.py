@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from forewarp.data import dnerf, nhr, posed_video
+from forewarp.data.cameras import check_middle
 from forewarp.data.checks import check_seen, remarks
 from forewarp.data.files import SceneError
 from forewarp.data.images import is_premultiplied, straight, write_image
@@ -302,3 +303,23 @@ def test_all_cameras_of_a_long_walk_are_asked_for_points_at_no_cost_of_their_siz
     box = Box((-1, 0, -1), (400, 4, 1))
     assert list(remarks(replace(SCENE, train=tuple(frames), box=box, has_alpha=False, still=points))) == []
     assert (len(bytes_of), sum(bytes_of)) == (400, 400)
+
+
+@pytest.mark.parametrize(
+    ("size", "middle", "advice"),
+    [
+        ((64, 48), (16, 12), "of images 2 times as small: scale them up"),
+        ((64, 48), (64, 48), "of images 2 times as large: scale them down"),
+        ((64, 48), (0.5, 0.5), "shares of the size: multiply"),
+        ((48, 64), (32, 24), "width and height seem exchanged"),
+    ],
+)
+def test_a_middle_of_other_images_is_named(size, middle, advice):
+    camera = Camera(*size, 50.0, 50.0, *middle, torch.eye(4).double(), 0.1, 1.0)
+    with pytest.raises(SceneError, match=advice):
+        check_middle(camera, "cx")
+
+
+@pytest.mark.parametrize("middle", [(32, 24), (20, 24), (40, 30), (0, 0), (31, 27)])
+def test_a_middle_that_is_shifted_is_taken(middle):
+    check_middle(Camera(64, 48, 50.0, 50.0, *middle, torch.eye(4).double(), 0.1, 1.0), "cx")

@@ -165,7 +165,6 @@ BAD = {
         (ITEMS, lambda c: c["ids"].append("a\nb"), r"'a\\nb': expected an object for this item"),
         ("metadata.json", {f"{ITEM}.time_id": GONE}, rf"'{ITEM}'.time_id: expected a number"),
         ("metadata.json", {f"{ITEM}.time_id": 0.5}, "time_id: expected a whole number, but got 0.5"),
-        (f"rgb/2x/{ITEM}.png", None, f"{ITEM}.png: expected an image, but got No such file"),
         ("points.npy", TWO[:, :2], r"points.npy: expected points \(N, 3\), but got shape \(2, 2\)"),
     ],
     "video": [

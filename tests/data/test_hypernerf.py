@@ -166,3 +166,16 @@ def test_a_genuine_hand_held_video_is_understood():
     assert scene.canonical_time == pytest.approx(40 / 85)
     assert scene.train[0].time < scene.test[0].time < scene.train[1].time
     assert scene.still is None
+
+
+def test_images_that_are_missing_are_left_out_and_jpeg_is_read(tmp_path):
+    folder = write_rig(tmp_path / "toy", rig(size=(12, 8)))
+    before = read_scene(tmp_path, "toy", scale=1)
+    gone, other = before.train[0].name, before.train[1].name
+    (folder / "rgb" / "1x" / f"{gone}.png").unlink()
+    stored = folder / "rgb" / "1x" / f"{other}.png"
+    write_image(stored.with_suffix(".jpg"), before.train[1].load().numpy()[..., :3])
+    stored.unlink()
+    after = read_scene(tmp_path, "toy", scale=1)
+    assert [frame.name for frame in after.train] == [frame.name for frame in before.train[1:]]
+    assert f"images are not there and left out ({gone}.png, ..)" in after.protocol["assumed"][0]

@@ -218,6 +218,16 @@ def test_lists_choose_the_splits(tmp_path, made):
     assert [len(s) for s in (read_scene(tmp_path, "toy").train, read_scene(tmp_path, "toy").test)] == [2, 8]
 
 
+def test_where_no_listed_test_image_was_rendered_training_images_are_held_out(tmp_path, made):
+    made(splits=["train"] * 7 + ["test"] * 3)
+    listed = json.loads((tmp_path / "toy" / FILE).read_text())["test_filenames"]
+    for path in listed:
+        (tmp_path / "toy" / path).unlink()
+    scene = read_scene(tmp_path, "toy")
+    assert (len(scene.train), len(scene.test)) == (6, 1)
+    assert "every 8th training frame held out" in scene.protocol["split"]
+
+
 def test_nothing_depends_on_the_unit(tmp_path):
     unit, views = 1e3, posed_cameras(10)
     for view in views:

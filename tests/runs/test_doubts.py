@@ -7,6 +7,7 @@ import torch
 from forewarp.data.checks import blind_frames
 from forewarp.data.module import DNeRFDataModule, SceneDataModule
 from forewarp.runs.fitted import doubts
+from forewarp.scene.box import Box
 from forewarp.training.schedule import StageSettings
 from tests.support.tiny_scene import ball_scene
 
@@ -55,6 +56,8 @@ def test_cameras_that_see_nothing_of_the_box_are_counted():
     away = replace(camera, camera_to_world=turned)
     scene = replace(SCENE, train=(replace(SCENE.train[0], camera=away), *SCENE.train[1:]))
     assert (blind_frames(SCENE), blind_frames(scene)) == (0, 1)
+    small = Box((0.2, 0.2, 0.2), (0.21, 0.21, 0.21))  # between the nine pixels that are asked first
+    assert blind_frames(replace(SCENE, box=small)) == 0
     (line,) = doubts(run(scene=scene), reaching(30))
     assert line.startswith(f"1 of {len(scene.train)} training cameras see nothing of the box")
     in_file = {"normalisation": {"center": [10.0, 0.0, 0.0], "scale": 0.5}}  # remarks and data.box are of it

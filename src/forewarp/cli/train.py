@@ -90,7 +90,7 @@ def measure(prepared, module) -> float | None:
     if config.evaluate:
         measure_run(run, module, config)
     else:
-        fitted = f"fitted: {run.folder}; measure it with forewarp-evaluate run={run.folder}"
+        fitted = f"fitted: {run.folder}; measure it with forewarp-evaluate {quote(f'run={run.folder}')}"
         print(fitted, *notes_of(module.method.protocol()), sep="\n")
         tell(doubts(run, module.to(run.device)))
     draw_own(run.folder)

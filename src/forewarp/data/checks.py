@@ -10,13 +10,15 @@ from torch import Tensor
 from forewarp.data.cameras import nine_pixels
 from forewarp.data.files import mismatch
 from forewarp.data.transforms import common_point
-from forewarp.scene.box import Box
+from forewarp.scene.box import Box, Lattice
 from forewarp.scene.camera import Camera, focus_point
 from forewarp.scene.frame import Scene, sightings, spread
 
 _LOOKED_AT = 8  # training images whose alpha is looked at
 _PIXELS = 4000  # of each
 _EDGE, _LEFT_OUT = 0.9, 0.02  # shares of an inverted image: subject along its edges, background at least
+_WITHIN = 5  # points along a side of the box that cameras are asked for
+_FAINT = 8  # of 255: alpha that is nowhere above it was written as 0 and 1
 _CUT_OFF, _FEW = 0.1, 0.5  # share of the subject beyond the box; of pixels and points that is too few
 # What mends near or far, the box, and all three, by format; "" is any other.
 _REMEDIES = {
@@ -111,7 +113,10 @@ def _silhouettes(scene: Scene, *, bounded: bool) -> Iterator[str]:
     """
     frames = [scene.train[i] for i in spread(len(scene.train), _LOOKED_AT)]
     alphas = [frame.load()[..., 3].clone() for frame in frames]
-    half = max(int(alpha.max()) for alpha in alphas) // 2
+    greatest = max(int(alpha.max()) for alpha in alphas)
+    if 0 < greatest <= _FAINT:
+        yield f"alpha is at most {greatest} of 255, as if it were written as 0 and 1; write 0 and 255"
+    half = greatest // 2
     solid = [alpha > half for alpha in alphas]
     empty = [not bool(mask.any()) for mask in solid]
     if all(empty) and not any(bool(frame.load()[..., 3].any()) for frame in scene.train):
@@ -179,6 +184,18 @@ def check_seen(scene: Scene) -> None:
 
 
 def blind_frames(scene: Scene) -> int:
-    """Count the training frames whose camera sees nothing of the box between its near and far planes."""
-    cameras = (frame.camera for frame in scene.train)
-    return sum(not bool(meets(camera, scene.box, nine_pixels(camera)).any()) for camera in cameras)
+    """Count the training frames whose camera sees nothing of the box between its near and far planes: neither
+    through nine of its pixels, nor any of 125 points of the box, which may lie between these.
+    """
+    lattice = Lattice.of_count(scene.box, _WITHIN**3)
+    points = lattice.to_world(lattice.all_voxels()).double()
+
+    def sees(camera: Camera) -> bool:
+        pixel, depth = camera.project(points)
+        column, row = pixel.unbind(-1)
+        inside = (depth > 0) & (column >= 0) & (row >= 0) & (column < camera.width) & (row < camera.height)
+        away = (points - camera.center).norm(dim=-1)
+        inside &= (away > camera.near) & (away < camera.far)
+        return bool(inside.any() or meets(camera, scene.box, nine_pixels(camera)).any())
+
+    return sum(not sees(frame.camera) for frame in scene.train)

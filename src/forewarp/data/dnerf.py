@@ -297,6 +297,9 @@ def _read_file(
         there, assumed = with_images(list(zip(entries, images)), images, str(path))
     else:
         there, assumed = [], [f"{path}: none of its {len(images)} images is there: left out"]
+    if ours := [key for key in ("near", "far", "aabb") if content.get(key) is not None]:
+        keys = "data.near, data.far and data.box"
+        assumed.append(f"{path}: {', '.join(ours)} left aside, as this layout has none; set {keys}")
     for entry, image in there:
         depth, ability = None, entry.get("ability")
         if "depth_file_path" in entry.own:

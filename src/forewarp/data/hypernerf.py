@@ -34,7 +34,7 @@ from forewarp.data.cameras import (
 )
 from forewarp.data.files import Entry, inside, mismatch, number, read_json, remove, scene_folder, whole
 from forewarp.data.images import StoredImage, check_pixels, inspect_image, write_image
-from forewarp.data.transforms import looks_turned
+from forewarp.data.transforms import looks_turned, with_images, with_suffix
 from forewarp.files import write_json
 from forewarp.scene.camera import Camera, Lens
 from forewarp.scene.frame import Frame, Scene, Truth, middle_of
@@ -87,10 +87,16 @@ def read_scene(root: str | Path, scene: str, *, scale: int = 2, box: Sequence[fl
     normalised = Normalisation(center, size, near, far)
     how, ids, train_ids, test_ids = _read_split(folder / "dataset.json")
     times, camera_ids = _read_items(folder / "metadata.json", ids)
+    where = f"{folder / 'dataset.json'}: ids"
+    paths = {item: with_suffix(inside(images, item, where)) for item in ids}
+    there, assumed = with_images(ids, list(paths.values()), where)
+    train_ids, test_ids = ([item for item in part if item in set(there)] for part in (train_ids, test_ids))
+    for part, names in (("train_ids", train_ids), ("val_ids", test_ids)):
+        if not names:
+            raise mismatch(folder / "dataset.json", f"an image of {part} that is there", "none")
 
     def frame(item: str) -> Frame:
-        where = f"{folder / 'dataset.json'}: ids"
-        path = inside(images, f"{item}.png", where)
+        path = paths[item]
         camera = read_camera(inside(folder / "camera", f"{item}.json", where), near, far)
         camera = reduced(normalised.camera(camera), scale)
         size = camera.width, camera.height
@@ -109,10 +115,12 @@ def read_scene(root: str | Path, scene: str, *, scale: int = 2, box: Sequence[fl
         "test_frames": len(test),
     }
     if looks_turned([frame.camera.camera_to_world for frame in train]):
-        protocol["assumed"] = [
+        assumed.append(
             f"{folder / 'camera'}: orientation taken as world-to-camera with OpenCV's axes, by which the "
             "cameras do not look at one thing; invert it, or convert OpenGL's axes, if it is written so"
-        ]
+        )
+    if assumed:
+        protocol["assumed"] = assumed
     bounds = frustum_box(f.camera for f in train) if box is None else box_of(box)
     truth = read_truth(folder / "trajectories.npz", canonical)
     if truth is not None:

@@ -143,6 +143,8 @@ def read_scene(
     file = scene_folder(root, scene, "posed_video") / FILE
     content = stated(read_json(file))
     entries, absent, assumed = _read_entries(file, content, scale, axes, inverse, masks)
+    if (file.parent / "masks").is_dir() and not any("mask_path" in f for f in content["frames"]):
+        assumed.append(f"{file}: masks/ is there, but no frame has a mask_path: they are not used")
     cut_out = [entry.load for entry in entries if entry.has_alpha]
     premultiplied, told = alpha_of(alpha, [load.path for load in cut_out], file)
     assumed += told
@@ -352,6 +354,9 @@ def _split_entries(
         for home in [split for split in ("train", "test") if split not in listed][:1]:
             parts[home] = [e for e in entries if not any(e.name in split for split in names.values())]
         how = "as listed in the file"
+        if not parts["test"] and names.get("test") and names["test"] <= absent:  # never rendered
+            parts["train"], parts["test"] = hold_out_every(parts["train"], test_every)
+            how += f", no image of test_filenames is there: every {test_every}th training frame held out"
     else:
         train, test = hold_out_every(entries, test_every)
         parts = {"train": train, "val": [], "test": test}

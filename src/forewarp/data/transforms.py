@@ -28,6 +28,7 @@ MODELS = ("OPENCV", "PINHOLE", "RADIAL", "SIMPLE_RADIAL", "SIMPLE_PINHOLE")
 AXES = ("opengl", "opencv")
 # Keys of instant-ngp that say that the lens is none of these, whatever k1 .. say.
 _OTHER_LENSES = ("is_fisheye", "ftheta_p0", "latlong", "equirectangular")
+_UNREAD_LENSES = ("distortion_params", "distortion", "dist_coeffs", "distortion_coefficients", "dist")
 _FOCAL = ("fl_x", "fl_y", "camera_angle_x")
 _SAME_FOCAL = 0.02  # share by which two focal lengths of one camera may differ
 _OUTSIDE = 0.9  # share of a side beyond which a principal point is another image's
@@ -89,9 +90,10 @@ def camera_of(
     for key in ("k4", "k5", "k6"):
         if entry.number(key, default=0.0) != 0:
             raise mismatch(entry.where(key), "0", entry.get(key), "undistort the images")
-    if entry.get("distortion_params") and not any(k + p):
-        expected, got = "a lens as k1 k2 k3 p1 p2", short(entry.get("distortion_params"))
-        raise mismatch(entry.where("distortion_params"), expected, got, "write its terms under these names")
+    for key in _UNREAD_LENSES:
+        if entry.get(key) and not any(k + p):
+            expected, got = "a lens as k1 k2 k3 p1 p2", short(entry.get(key))
+            raise mismatch(entry.where(key), expected, got, "write its terms under these names")
     lens = Lens(k, p) if any(k + p) else None
     camera = Camera(width, height, fx, fy, cx, cy, pose, 0.0, 0.0, lens=lens)
     camera = camera.resized(*stored) if (width, height) != tuple(stored) else camera
@@ -193,7 +195,9 @@ def check_directions(
             where,
             "cameras that look at what they surround (OpenGL's axes: x right, y up, looking along -z)",
             "cameras that all look away from one point",
-            advice or "set data.axes=opencv, or data.axes=opengl if they do look outwards",
+            advice
+            or "set data.axes=opencv (of PyTorch3D's, x left and y up, turn the poses about z first), "
+            "or data.axes=opengl if they do look outwards",
         )
     if miss < _MEET and ahead < _ALL:
         expected, got = "cameras that look at one thing", f"{1 - ahead:.0%} of them that look away from it"
