@@ -249,9 +249,9 @@ def _sweep(scene: Scene, i: int, side: int, small: _Small, before: Tensor) -> tu
     )
     rows, columns = rows.flatten(), columns.flatten()
     rays = camera.rays(rows * camera.width + columns)
-    swept = _in_holes(before, rays.origins + rays.directions, camera, side)
-    swept &= valid[rows, columns]  # what is not learned from is no start either
-    rays, color = rays[swept], rgb[rows[swept], columns[swept]]
+    is_hole = _in_holes(before, rays.origins + rays.directions, camera, side)
+    is_hole &= valid[rows, columns]  # what is not learned from is no start either
+    rays, color = rays[is_hole], rgb[rows[is_hole], columns[is_hole]]
     time = scene.train[i].time
     neighbours = sorted(
         (j for j in range(len(scene.train)) if j != i),
