@@ -312,6 +312,8 @@ def test_all_cameras_of_a_long_walk_are_asked_for_points_at_no_cost_of_their_siz
         ((64, 48), (64, 48), "of images 2 times as large: scale them down"),
         ((64, 48), (0.5, 0.5), "shares of the size: multiply"),
         ((48, 64), (32, 24), "width and height seem exchanged"),
+        ((64, 48), (16.6, 11.7), "of images 1.99 times as small"),  # 3 % off the middle
+        ((60, 48), (23.2, 31.3), "width and height seem exchanged"),
     ],
 )
 def test_a_middle_of_other_images_is_named(size, middle, advice):
@@ -320,6 +322,6 @@ def test_a_middle_of_other_images_is_named(size, middle, advice):
         check_middle(camera, "cx")
 
 
-@pytest.mark.parametrize("middle", [(32, 24), (20, 24), (40, 30), (0, 0), (31, 27)])
+@pytest.mark.parametrize("middle", [(32, 24), (20, 24), (40, 30), (0, 0), (31, 27), (25, 18)])
 def test_a_middle_that_is_shifted_is_taken(middle):
     check_middle(Camera(64, 48, 50.0, 50.0, *middle, torch.eye(4).double(), 0.1, 1.0), "cx")

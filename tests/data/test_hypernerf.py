@@ -1,8 +1,10 @@
 """HyperNeRF captures: what is written is read, and real ones are understood."""
 
 import json
+import re
 import shutil
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 import pytest
@@ -116,6 +118,38 @@ def test_intrinsics_of_larger_images_are_named(tmp_path):
         edit(file, lambda content: content.update(principal_point=content["image_size"]))
     with pytest.raises(SceneError, match="principal_point: expected .* are of images 2 times as large"):
         read_scene(tmp_path, "toy", scale=1)
+
+
+def _by_translation(content):
+    content["position"] = (-np.array(content["orientation"]) @ content["position"]).tolist()
+
+
+def _transposed(content):
+    content["orientation"] = np.array(content["orientation"]).T.tolist()
+
+
+def _of_opengl(content):
+    content["orientation"] = (np.diag([1, -1, -1]) @ content["orientation"]).tolist()
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ([_by_translation], r"position is the translation t .* \(write -orientation\^T t\); if so"),
+        ([_transposed], r"orientation is camera-to-world \(transpose it\); if so"),
+        ([_of_opengl], r"if the axes are OpenGL's \(then negate the last two rows of orientation\); if so"),
+        ([_of_opengl, _by_translation], r"translation t .* and the axes are OpenGL's"),
+        ([_by_translation, _transposed], r"is camera-to-world .* and position is the translation t"),
+        ([], None),
+    ],
+)
+def test_camera_files_that_hold_another_pose_are_named(changes, said, tmp_path):
+    folder = write_rig(tmp_path / "toy", rig(times=12))
+    for file, change in product((folder / "camera").iterdir(), changes):
+        edit(file, change)
+    lines = read_scene(tmp_path, "toy").protocol.get("assumed", [])
+    assert len(lines) == (said is not None)
+    assert all(re.search(said, line) for line in lines)
 
 
 def test_both_spellings_of_the_tangential_distortion(tmp_path):

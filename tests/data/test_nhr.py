@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+from forewarp.data.cameras import FLIP
 from forewarp.data.files import SceneError
 from forewarp.data.images import write_image
 from forewarp.data.nhr import read_scene
@@ -184,6 +185,49 @@ def test_an_excerpt_is_read_in_order(toy):
         for number, f in ((9, 0), (11, 1), (15, 2)):
             if (cloud := toy / "pointclouds" / f"frame{number}.npy").exists():
                 cloud.rename(cloud.with_name(f"frame{f}.npy"))
+
+
+def _columns(order):
+    return lambda matrix: matrix[:3, order].T
+
+
+@pytest.mark.parametrize(
+    ("written_as", "said"),
+    [
+        (lambda pose: _columns([2, 0, 1, 3])(pose @ FLIP), "only if the axes are OpenGL's; convert them"),
+        (lambda pose: _columns([2, 0, 1, 3])(np.linalg.inv(pose)), "only if they are world-to-camera; conv"),
+        (_columns([0, 1, 2, 3]), "only if the columns are x, y, z, centre; convert them"),
+        (
+            lambda pose: _columns([0, 1, 2, 3])(pose @ FLIP),
+            "x, y, z, centre and the axes are OpenGL's; convert them",
+        ),
+        (
+            lambda pose: pose[:3],
+            "line 1: expected columns z, x, y, centre .*, but got its rows; write the col",
+        ),
+    ],
+)
+def test_poses_written_in_another_way_are_named(tmp_path, written_as, said):
+    folder = write_dome(tmp_path / "toy", dome(8), 1)
+    lines = [written_as(camera.camera_to_world.numpy()).flatten().tolist() for camera in dome(8)]
+    (folder / "CamPose.inf").write_text("\n".join(" ".join(map(repr, line)) for line in lines))
+    with pytest.raises(SceneError, match=f"CamPose.inf: .*{said}"):
+        read_scene(tmp_path, "toy")
+
+
+@pytest.mark.parametrize(
+    ("factor", "said"),
+    [(0.5, "of images 1.99 times as small: scale them up"), (2, "of images 2.01 times as large: scale them")],
+)
+@pytest.mark.parametrize("half", [False, True])
+def test_intrinsics_of_images_of_another_size_are_named(toy, factor, said, half):
+    blocks = [
+        f"{k} {factor * c.fx} {factor * c.skew} {factor * c.cx} 0 {factor * c.fy} {factor * c.cy} 0 0 1"
+        for k, c in enumerate(dome())
+    ]
+    (toy / "Intrinsic.inf").write_text("\n".join(blocks))
+    with pytest.raises(SceneError, match=f"Intrinsic.inf: camera 0: expected a principal point .*{said}"):
+        read_scene(toy.parent, "toy", half_resolution=half)
 
 
 def test_reading_a_scene_decodes_no_image(written, monkeypatch):

@@ -15,14 +15,11 @@ from forewarp.data.files import Entry, SceneError, layout_of
 from forewarp.data.module import DNeRFDataModule
 from forewarp.data.transforms import (
     camera_of,
-    check_directions,
     check_times,
     left_aside,
-    looks_turned,
     times_of,
 )
-from forewarp.scene.camera import look_at
-from tests.support.written_scenes import dnerf_shots, edit, write_dnerf
+from tests.support.written_scenes import around, dnerf_shots, edit, write_dnerf
 
 EYE = torch.eye(4, dtype=torch.float64)
 WIDE = 2 * math.atan(0.5)  # of images as wide as their focal length
@@ -114,40 +111,6 @@ def test_times_that_a_file_does_not_tell_are_in_the_names(names, times):
     assert (
         "all times lie from 0.1 to 0.102" in times_of(names, [0.1, *[0.102] * (len(names) - 1)], "t.json")[1]
     )
-
-
-def around(count=8):
-    angles = [2 * math.pi * i / count for i in range(count)]
-    places = [torch.tensor([4 * math.cos(a), 4 * math.sin(a), 1.5], dtype=torch.float64) for a in angles]
-    up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
-    return [look_at(place, torch.zeros(3, dtype=torch.float64), up).double() for place in places]
-
-
-def test_poses_written_in_another_way_are_recognised():
-    flip, right = torch.from_numpy(FLIP), around()
-    check_directions(right, "t.json", inverse=False)
-    with pytest.raises(SceneError, match="look away from one point; set data.axes=opencv"):
-        check_directions([pose @ flip for pose in right], "t.json", inverse=False)
-    mixed = [pose @ flip if i % 2 else pose for i, pose in enumerate(right)]
-    with pytest.raises(SceneError, match="50% of them that look away from it; write all in the same axes"):
-        check_directions(mixed, "t.json", inverse=False)
-    for axes, stored in (("opencv", right), ("opengl", [pose @ flip for pose in right])):
-        misread = [torch.linalg.inv(pose) @ flip for pose in stored]
-        with pytest.raises(SceneError, match=f"set data.inverse=true data.axes={axes}"):
-            check_directions(misread, "t.json", inverse=False)
-    in_a_row = [right[0].clone() for _ in range(6)]
-    for i, pose in enumerate(in_a_row):
-        pose[:3, 3] += i * pose[:3, 0]
-    check_directions(in_a_row, "t.json", inverse=False)
-
-
-def test_orientations_that_are_inverted_or_of_other_axes_are_recognised():
-    right, inverted = around(), around()
-    for pose in inverted:
-        pose[:3, :3] = pose[:3, :3].T.clone()
-    assert not looks_turned(right)
-    assert looks_turned(inverted)
-    assert looks_turned([pose @ torch.from_numpy(FLIP) for pose in right])
 
 
 def test_splits_that_disagree_or_overlap_are_named(tmp_path):

@@ -55,6 +55,13 @@ def two_points(*times) -> Truth:
     return Truth(torch.arange(18.0).reshape(2, 3, 3), torch.tensor(times, dtype=torch.float64))
 
 
+def around(count=8) -> list[torch.Tensor]:
+    """Poses on a circle of radius 4, which look at the origin."""
+    angles = [2 * math.pi * i / count for i in range(count)]
+    places = [torch.tensor([4 * math.cos(a), 4 * math.sin(a), 1.5], dtype=torch.float64) for a in angles]
+    return [look_at(place, torch.zeros(3, dtype=torch.float64), UP).double() for place in places]
+
+
 # D-NeRF and Lego Complete ----------------------------------------------------------------------------------
 
 ANGLE = 0.6911112

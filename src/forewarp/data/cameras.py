@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -20,8 +21,8 @@ log = logging.getLogger(__name__)
 
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenGL's axes of a camera to OpenCV's, and back
 MOST_UNITS = 1e9  # largest coordinate: farther from the origin single precision is long lost
-_LARGER, _SAME_FACTOR = 1.5, 0.05  # of a middle beyond the image's own, which tells a larger image's
-_LEAST_FACTOR, _EXCHANGED = 0.1, 0.02  # of a smaller image's middle; by which exchanged sides may be off
+_LARGER, _SAME_FACTOR = 1.5, 0.1  # of a middle beyond the image's own, which tells a larger image's
+_LEAST_FACTOR, _EXCHANGED = 0.1, 0.05  # of a smaller image's middle; by which exchanged sides may be off
 _FEW_PIXELS = 8  # of a side, which is no image
 SPLITS = ("train", "val", "test")
 _SAME_PIXEL = 0.01
@@ -116,13 +117,16 @@ def check_middle(camera: Camera, where: str) -> None:
     of_one_factor = min(across, down) > _LEAST_FACTOR and abs(across / down - 1) < _SAME_FACTOR
     exchanged = 2 * camera.cx / camera.height, 2 * camera.cy / camera.width
     advice = None
+    factor = math.sqrt(across * down) if of_one_factor else 1.0
     if 0 < max(camera.cx, camera.cy) <= 1 < min(camera.width, camera.height) / _FEW_PIXELS:
         advice = "they are shares of the size: multiply cx and fl_x by the width, cy and fl_y by the height"
-    elif of_one_factor and not 1 / _LARGER < across < _LARGER:
-        size, way = (across, "down") if across > 1 else (1 / across, "up")
-        larger = "large" if across > 1 else "small"
+    elif not 1 / _LARGER < factor < _LARGER:
+        size, way = (factor, "down") if factor > 1 else (1 / factor, "up")
+        larger = "large" if factor > 1 else "small"
         advice = f"the intrinsics are of images {size:.3g} times as {larger}: scale them {way}"
-    elif abs(across - 1) > _SAME_FACTOR and all(abs(share - 1) < _EXCHANGED for share in exchanged):
+    elif min(abs(across - 1), abs(down - 1)) > _SAME_FACTOR and all(
+        abs(share - 1) < _EXCHANGED for share in exchanged
+    ):
         advice = "width and height seem exchanged: exchange cx and cy, fl_x and fl_y"
     if advice is not None:
         got = f"({camera.cx:g}, {camera.cy:g}) of {camera.width} x {camera.height} pixels"

@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from forewarp.data.cameras import nine_pixels
+from forewarp.data.directions import common_point
 from forewarp.data.files import mismatch
-from forewarp.data.transforms import common_point
 from forewarp.scene.box import Box, Lattice
 from forewarp.scene.camera import Camera, focus_point
 from forewarp.scene.frame import Scene, sightings, spread

@@ -35,12 +35,12 @@ from forewarp.data.cameras import (
     opengl_rows,
     space_of,
 )
+from forewarp.data.directions import check_directions
 from forewarp.data.files import MARKERS, frames_of, mismatch, number, read_json, remove, scene_folder, whole
 from forewarp.data.images import StoredImage, alpha_of, by, check_pixels, inspect_image, write_image
 from forewarp.data.transforms import (
     camera_of,
     check_axes,
-    check_directions,
     check_times,
     hold_out_every,
     left_aside,

@@ -32,9 +32,10 @@ from forewarp.data.cameras import (
     frustum_box,
     pose_of,
 )
+from forewarp.data.directions import opposite, other_readings
 from forewarp.data.files import Entry, inside, mismatch, number, read_json, remove, scene_folder, whole
 from forewarp.data.images import StoredImage, check_pixels, inspect_image, write_image
-from forewarp.data.transforms import looks_turned, with_images, with_suffix
+from forewarp.data.transforms import with_images, with_suffix
 from forewarp.files import write_json
 from forewarp.scene.camera import Camera, Lens
 from forewarp.scene.frame import Frame, Scene, Truth, middle_of
@@ -43,6 +44,27 @@ _SCALES, _ASPECTS = (1e-6, 1e6), (1e-2, 1e2)
 _MOST_PIXELS, _MOST_PIXELS_OFF, _MOST_BENT = 1e5, 1e7, 1e3  # beyond them a camera file is wrong
 _MOST_MOMENTS = 1e9
 _EVERY = 4  # the published interpolation protocol: train on every fourth, test midway between
+
+
+def _transposed(poses: Tensor) -> Tensor:
+    """Invert the rotations of poses (N, 4, 4) alone."""
+    changed = poses.clone()
+    changed[:, :3, :3] = poses[:, :3, :3].mT
+    return changed
+
+
+def _by_translation(poses: Tensor) -> Tensor:
+    """Take the places of poses (N, 4, 4) for translations of their inverses."""
+    changed = poses.clone()
+    changed[:, :3, 3:] = -poses[:, :3, :3] @ poses[:, :3, 3:]
+    return changed
+
+
+_READINGS = {  # what else may be in a camera file, with what mends it
+    "orientation is camera-to-world (transpose it)": _transposed,
+    "position is the translation t of a world-to-camera matrix (write -orientation^T t)": _by_translation,
+    "the axes are OpenGL's (then negate the last two rows of orientation)": opposite,
+}
 
 
 @dataclass(frozen=True)
@@ -95,9 +117,12 @@ def read_scene(root: str | Path, scene: str, *, scale: int = 2, box: Sequence[fl
         if not names:
             raise mismatch(folder / "dataset.json", f"an image of {part} that is there", "none")
 
+    stored: dict[str, Tensor] = {}  # poses in the unscaled world
+
     def frame(item: str) -> Frame:
         path = paths[item]
         camera = read_camera(inside(folder / "camera", f"{item}.json", where), near, far)
+        stored[item] = camera.camera_to_world
         camera = reduced(normalised.camera(camera), scale)
         size = camera.width, camera.height
         inspect_image(path, size, f", the camera's image_size / {scale}")
@@ -114,11 +139,9 @@ def read_scene(root: str | Path, scene: str, *, scale: int = 2, box: Sequence[fl
         "train_frames": len(train),
         "test_frames": len(test),
     }
-    if looks_turned([frame.camera.camera_to_world for frame in train]):
-        assumed.append(
-            f"{folder / 'camera'}: orientation taken as world-to-camera with OpenCV's axes, by which the "
-            "cameras do not look at one thing; invert it, or convert OpenGL's axes, if it is written so"
-        )
+    if ways := other_readings(list(stored.values()), _READINGS):
+        line = "cameras do not look at one thing, as all of them do if"
+        assumed.append(f"{folder / 'camera'}: {line} {', or if '.join(ways)}; if so, write them anew")
     if assumed:
         protocol["assumed"] = assumed
     bounds = frustum_box(f.camera for f in train) if box is None else box_of(box)

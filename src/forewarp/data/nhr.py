@@ -19,7 +19,8 @@ import torch
 
 from forewarp.data.arrays import read_cloud, read_truth, shortened, write_array, write_truth
 from forewarp.data.cameras import box_of, check_middle, pose_of
-from forewarp.data.files import mismatch, numbers_of, read_bytes, remove, scene_folder, whole
+from forewarp.data.directions import inverted, opposite, other_readings
+from forewarp.data.files import SceneError, mismatch, numbers_of, read_bytes, remove, scene_folder, whole
 from forewarp.data.images import StoredImage, by, check_pixels, inspect_image, write_image
 from forewarp.files import replace_file
 from forewarp.scene.box import Box
@@ -28,6 +29,11 @@ from forewarp.scene.frame import Frame, Scene, Truth
 
 _PADDING = 0.1  # of the points' extent, on every side
 _ORDER = [2, 0, 1, 3]  # of a pose's columns in a line: z axis, x axis, y axis, centre
+_READINGS = {  # what else may be in a line
+    "the columns are x, y, z, centre": lambda poses: poses[..., _ORDER],
+    "they are world-to-camera": inverted,
+    "the axes are OpenGL's": opposite,
+}
 _MOST_PIXELS_OFF = 1e7  # beyond it a lens is wrong
 
 
@@ -162,13 +168,25 @@ def _read_poses(path: Path) -> list[np.ndarray]:
     """Read camera-to-world matrices (4, 4) float64 with OpenCV's axes, one a line.
 
     Raises:
-        SceneError: naming the line that does not hold 12 numbers, or no rotation.
+        SceneError: naming the line that does not hold 12 numbers, or no rotation; and where the cameras would
+            look at one thing if poses were written in another way.
     """
-    poses = []
+    poses, expected = [], "columns z, x, y, centre of [R|T], camera-to-world with OpenCV's axes"
     for line, words in _lines(path):
         matrix, where = np.eye(4), f"{path}: line {line}"
-        matrix[:3, _ORDER] = np.array(numbers_of(words, 12, where)).reshape(4, 3).T
-        poses.append(pose_of(matrix, where))
+        values = np.array(numbers_of(words, 12, where))
+        matrix[:3, _ORDER] = values.reshape(4, 3).T
+        try:
+            poses.append(pose_of(matrix, where))
+        except SceneError as error:
+            try:
+                pose_of(values.reshape(3, 4), where)
+            except SceneError:
+                raise error from None
+            raise mismatch(where, expected, "its rows", "write the columns one after the other") from None
+    if ways := other_readings([torch.from_numpy(pose) for pose in poses], _READINGS):
+        got = f"cameras that look at one thing only if {', or if '.join(ways)}"
+        raise mismatch(path, expected, got, "convert them")
     return poses
 
 

@@ -23,6 +23,7 @@ from torch import Tensor
 
 from forewarp.data.arrays import read_cloud, write_array
 from forewarp.data.cameras import MOST_UNITS, SPLITS, box_of, opengl_rows, space_of
+from forewarp.data.directions import check_directions
 from forewarp.data.files import (
     frames_of,
     inside,
@@ -49,7 +50,6 @@ from forewarp.data.images import (
 from forewarp.data.transforms import (
     camera_of,
     check_axes,
-    check_directions,
     check_times,
     hold_out_every,
     left_aside,

@@ -32,12 +32,9 @@ _UNREAD_LENSES = ("distortion_params", "distortion", "dist_coeffs", "distortion_
 _FOCAL = ("fl_x", "fl_y", "camera_angle_x")
 _SAME_FOCAL = 0.02  # share by which two focal lengths of one camera may differ
 _OUTSIDE = 0.9  # share of a side beyond which a principal point is another image's
-_LEAST_CAMERAS = 4  # of which can be told whether they look at something in common
-_ALL = 0.9  # share of cameras before which a common point must lie
 _MOST_TIME = 1e20
 _LEAST_SPAN, _MOST_FAR = 0.05, 0.1  # of all times: less is hardly what was meant; share that may be wrong
 _ROUNDING = 1e-6  # beyond 0 and 1
-_MEET, _MISS = 0.15, 0.5  # miss of the axes in shares of the distance: they meet in a point, they do not
 _CAMERA_WORDS = re.compile(r"(cam|camera|view|sensor|c|v)[_-]?$", re.IGNORECASE)
 
 
@@ -170,101 +167,6 @@ def check_axes(axes: object, inverse: object) -> None:
         raise mismatch("data.axes", f"{' or '.join(AXES)}, or null", repr(axes))
     if not isinstance(inverse, bool):
         raise mismatch("data.inverse", "true or false", repr(inverse))
-
-
-def check_directions(
-    poses: Sequence[torch.Tensor], where: str, *, inverse: bool, advice: str | None = None
-) -> None:
-    """Refuse poses that make sense only if they were written in another way than assumed.
-
-    Args:
-        poses: as ``pose_in`` reads them where ``data.axes`` is null.
-        where: the file, for errors.
-        inverse: whether they were taken for world-to-camera matrices.
-        advice: what to do, where keys would not mend it.
-
-    Raises:
-        SceneError: if all cameras look away from one point, as OpenCV's axes read as OpenGL's do, or have
-            nothing in common but their inverses have: naming the key that mends it.
-    """
-    if len(poses) < _LEAST_CAMERAS:
-        return
-    miss, ahead, _ = _meeting(torch.stack(list(poses)))
-    if miss < _MEET and ahead == 0:
-        raise mismatch(
-            where,
-            "cameras that look at what they surround (OpenGL's axes: x right, y up, looking along -z)",
-            "cameras that all look away from one point",
-            advice
-            or "set data.axes=opencv (of PyTorch3D's, x left and y up, turn the poses about z first), "
-            "or data.axes=opengl if they do look outwards",
-        )
-    if miss < _MEET and ahead < _ALL:
-        expected, got = "cameras that look at one thing", f"{1 - ahead:.0%} of them that look away from it"
-        advice = advice or "write all in the same axes, or set data.axes=opengl if they are right"
-        raise mismatch(where, expected, got, advice)
-    if miss < _MISS or inverse:
-        return
-    for axes, flip in (("opengl", torch.from_numpy(FLIP)), ("opencv", torch.eye(4, dtype=torch.float64))):
-        # What was read as ``matrix @ FLIP`` is taken back, inverted, and given these axes.
-        others = torch.linalg.inv(torch.stack(list(poses)) @ torch.from_numpy(FLIP)) @ flip
-        miss, ahead, _ = _meeting(others)
-        if miss < _MEET and ahead == 1:
-            raise mismatch(
-                where,
-                "camera-to-world matrices",
-                "cameras that look at nothing in common, as their inverses do",
-                advice or f"set data.inverse=true data.axes={axes}, or data.axes=opengl if they are right",
-            )
-
-
-def looks_turned(poses: Sequence[torch.Tensor]) -> bool:
-    """Tell whether cameras all look away from a point, or would look at one with their rotations inverted.
-
-    Args:
-        poses: camera-to-world (4, 4) with OpenCV's axes.
-    """
-    if len(poses) < _LEAST_CAMERAS:
-        return False
-    poses = torch.stack(list(poses))
-    turned = poses.clone()
-    turned[:, :3, :3] = poses[:, :3, :3].mT
-    (miss, ahead, _), (others_miss, others_ahead, _) = _meeting(poses), _meeting(turned)
-    if miss < _MEET:
-        return ahead == 0
-    return miss >= _MISS and others_miss < _MEET and others_ahead == 1
-
-
-def common_point(poses: Sequence[torch.Tensor]) -> torch.Tensor | None:
-    """Return the point (3,) that nearly all cameras look at, float64; None where there is none.
-
-    Args:
-        poses: camera-to-world (4, 4) with OpenCV's axes.
-    """
-    if len(poses) < _LEAST_CAMERAS:
-        return None
-    miss, ahead, point = _meeting(torch.stack(list(poses)))
-    return point if miss < _MEET and ahead >= _ALL else None
-
-
-def _meeting(poses: torch.Tensor) -> tuple[float, float, torch.Tensor | None]:
-    """Return how far the optical axes of poses (N, 4, 4) miss a common point, how many have it ahead, and it.
-
-    The first is the median over cameras of the point's distance from the axis over its distance from the
-    camera, infinite where axes are nearly parallel or cameras stand in one place; the second is a share.
-    """
-    centers, axes = poses[:, :3, 3], poses[:, :3, 2]
-    across = torch.eye(3, dtype=torch.float64) - axes[:, :, None] * axes[:, None, :]
-    normal = across.sum(0)
-    if float(torch.linalg.eigvalsh(normal)[0]) < 0.02 * len(poses):  # nearly parallel
-        return math.inf, 0.5, None
-    point = torch.linalg.solve(normal, (across @ centers[:, :, None]).sum(0)[:, 0])
-    away = point - centers
-    distance = away.norm(dim=-1)
-    if float(distance.median()) < 1e-9 * (1 + float(centers.abs().max())):
-        return math.inf, 0.5, None
-    miss = (across @ away[:, :, None])[..., 0].norm(dim=-1) / distance.clamp(min=1e-12)
-    return float(miss.median()), float(((away * axes).sum(-1) > 0).double().mean()), point
 
 
 def with_suffix(path: Path) -> Path:

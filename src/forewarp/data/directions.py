@@ -1,0 +1,128 @@
+"""Tell by what cameras look at whether their poses were written in another way than they are read."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from itertools import combinations
+
+import torch
+
+from forewarp.data.cameras import FLIP
+from forewarp.data.files import mismatch
+
+_LEAST_CAMERAS = 4  # of which can be told whether they look at something in common
+_ALL = 0.9  # share of cameras before which a common point must lie
+_MEET, _MISS = 0.15, 0.5  # miss of the axes in shares of the distance: they meet in a point, they do not
+
+
+def check_directions(
+    poses: Sequence[torch.Tensor], where: str, *, inverse: bool, advice: str | None = None
+) -> None:
+    """Refuse poses that make sense only if they were written in another way than assumed.
+
+    Args:
+        poses: as ``transforms.pose_in`` reads them where ``data.axes`` is null.
+        where: the file, for errors.
+        inverse: whether they were taken for world-to-camera matrices.
+        advice: what to do, where keys would not mend it.
+
+    Raises:
+        SceneError: if all cameras look away from one point, as OpenCV's axes read as OpenGL's do, or have
+            nothing in common but their inverses have: naming the key that mends it.
+    """
+    if len(poses) < _LEAST_CAMERAS:
+        return
+    miss, ahead, _ = _meeting(torch.stack(list(poses)))
+    if miss < _MEET and ahead == 0:
+        raise mismatch(
+            where,
+            "cameras that look at what they surround (OpenGL's axes: x right, y up, looking along -z)",
+            "cameras that all look away from one point",
+            advice
+            or "set data.axes=opencv (of PyTorch3D's, x left and y up, turn the poses about z first), "
+            "or data.axes=opengl if they do look outwards",
+        )
+    if miss < _MEET and ahead < _ALL:
+        expected, got = "cameras that look at one thing", f"{1 - ahead:.0%} of them that look away from it"
+        advice = advice or "write all in the same axes, or set data.axes=opengl if they are right"
+        raise mismatch(where, expected, got, advice)
+    # What was read as ``matrix @ FLIP`` is taken back, inverted, and given OpenGL's axes.
+    changes = {"data.inverse=true": lambda poses: opposite(inverted(opposite(poses)))}
+    ways = [] if inverse else other_readings(poses, changes | {"data.axes=opencv": opposite})
+    if ways:
+        got = "cameras that look at nothing in common, as their inverses do"
+        advice = advice or f"set {ways[0].replace(' and ', ' ')}, or data.axes=opengl if they are right"
+        raise mismatch(where, "camera-to-world matrices", got, advice)
+
+
+def other_readings(
+    poses: Sequence[torch.Tensor], changes: Mapping[str, Callable[[torch.Tensor], torch.Tensor]]
+) -> list[str]:
+    """Name the changes by which all cameras look at one point, in each way that needs the fewest.
+
+    There are none if poses may be right as they are: if their cameras look at about one point or, whatever is
+    changed, at none.
+
+    Args:
+        poses: camera-to-world (4, 4) with OpenCV's axes, as read.
+        changes: of poses (N, 4, 4), by name; several are applied in this order, and joined by "and".
+    """
+    if len(poses) < _LEAST_CAMERAS:
+        return []
+    poses, ways = torch.stack(list(poses)), []
+    miss, ahead, _ = _meeting(poses)
+    if (miss < _MEET and ahead > 0) or _MEET <= miss < _MISS:
+        return []
+    for count in range(1, len(changes) + 1):
+        for names in combinations(changes, count):
+            changed = poses
+            for name in names:
+                changed = changes[name](changed)
+            miss, ahead, _ = _meeting(changed)
+            ways += [" and ".join(names)] if miss < _MEET and ahead == 1 else []
+        if ways:
+            break
+    return ways
+
+
+def opposite(poses: torch.Tensor) -> torch.Tensor:
+    """Take poses (N, 4, 4) with OpenGL's axes for those of OpenCV, or the other way round."""
+    return poses @ torch.from_numpy(FLIP)
+
+
+def inverted(poses: torch.Tensor) -> torch.Tensor:
+    """Take world-to-camera matrices (N, 4, 4) for camera-to-world ones, or the other way round."""
+    return torch.linalg.inv(poses)
+
+
+def common_point(poses: Sequence[torch.Tensor]) -> torch.Tensor | None:
+    """Return the point (3,) that nearly all cameras look at, float64; None where there is none.
+
+    Args:
+        poses: camera-to-world (4, 4) with OpenCV's axes.
+    """
+    if len(poses) < _LEAST_CAMERAS:
+        return None
+    miss, ahead, point = _meeting(torch.stack(list(poses)))
+    return point if miss < _MEET and ahead >= _ALL else None
+
+
+def _meeting(poses: torch.Tensor) -> tuple[float, float, torch.Tensor | None]:
+    """Return how far the optical axes of poses (N, 4, 4) miss a common point, how many have it ahead, and it.
+
+    The first is the median over cameras of the point's distance from the axis over its distance from the
+    camera, infinite where axes are nearly parallel or cameras stand in one place; the second is a share.
+    """
+    centers, axes = poses[:, :3, 3], poses[:, :3, 2]
+    across = torch.eye(3, dtype=torch.float64) - axes[:, :, None] * axes[:, None, :]
+    normal = across.sum(0)
+    if float(torch.linalg.eigvalsh(normal)[0]) < 0.02 * len(poses):  # nearly parallel
+        return math.inf, 0.5, None
+    point = torch.linalg.solve(normal, (across @ centers[:, :, None]).sum(0)[:, 0])
+    away = point - centers
+    distance = away.norm(dim=-1)
+    if float(distance.median()) < 1e-9 * (1 + float(centers.abs().max())):
+        return math.inf, 0.5, None
+    miss = (across @ away[:, :, None])[..., 0].norm(dim=-1) / distance.clamp(min=1e-12)
+    return float(miss.median()), float(((away * axes).sum(-1) > 0).double().mean()), point

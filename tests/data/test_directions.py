@@ -1,0 +1,49 @@
+"""Poses that were written in another way than they are read are recognised by what their cameras look at."""
+
+import pytest
+import torch
+
+from forewarp.data.cameras import FLIP
+from forewarp.data.directions import check_directions, inverted, opposite, other_readings
+from forewarp.data.files import SceneError
+from tests.support.written_scenes import around
+
+CHANGES = {"inverse": inverted, "axes": opposite}
+
+
+def in_a_row():
+    poses = [around()[0].clone() for _ in range(6)]
+    for i, pose in enumerate(poses):
+        pose[:3, 3] += i * pose[:3, 0]
+    return poses
+
+
+def test_poses_written_in_another_way_are_recognised():
+    flip, right = torch.from_numpy(FLIP), around()
+    check_directions(right, "t.json", inverse=False)
+    with pytest.raises(SceneError, match="look away from one point; set data.axes=opencv"):
+        check_directions([pose @ flip for pose in right], "t.json", inverse=False)
+    mixed = [pose @ flip if i % 2 else pose for i, pose in enumerate(right)]
+    with pytest.raises(SceneError, match="50% of them that look away from it; write all in the same axes"):
+        check_directions(mixed, "t.json", inverse=False)
+    keys = {"data.inverse=true data.axes=opencv": right, "data.inverse=true": [pose @ flip for pose in right]}
+    for said, stored in keys.items():
+        misread = [torch.linalg.inv(pose) @ flip for pose in stored]
+        with pytest.raises(SceneError, match=f"; set {said}, or"):
+            check_directions(misread, "t.json", inverse=False)
+    check_directions(in_a_row(), "t.json", inverse=False)
+
+
+def test_several_ways_are_named():
+    right = [pose for pose in around(40) if pose[0, 3] > 3]  # of a narrow view
+    changes = CHANGES | {"halfway": lambda poses: opposite(poses)}
+    assert other_readings([pose @ torch.from_numpy(FLIP) for pose in right], changes) == ["axes", "halfway"]
+
+
+def test_the_fewest_changes_by_which_cameras_look_at_one_thing_are_named():
+    right, flip = torch.stack(around()), torch.from_numpy(FLIP)
+    ways = {"": right, "axes": right @ flip, "inverse": torch.linalg.inv(right)}
+    for said, poses in (ways | {"inverse and axes": torch.linalg.inv(right @ flip)}).items():
+        assert other_readings(list(poses), CHANGES) == [said] * bool(said)
+    assert other_readings(in_a_row(), CHANGES) == []
+    assert other_readings(list(torch.linalg.inv(right)[:3]), CHANGES) == []
