@@ -17,13 +17,14 @@ MAY_IMPORT = {
     "synth": {"ops", "scene", "data"},
     "browser": {"ops", "scene"},
     "renderer": {"ops", "scene", "fields"},
+    "glb": {"ops", "scene", "fields"},
     "methods": LOWER,
     "training": LOWER | {"methods"},
     "evaluation": LOWER | {"methods", "training"},
-    "runs": LOWER | {"methods", "training", "evaluation", "data"},
+    "runs": LOWER | {"glb", "methods", "training", "evaluation", "data"},
     "planning": LOWER | {"methods", "training", "evaluation", "data", "report", "runs"},
     "viewer": LOWER | {"browser", "methods", "training", "evaluation"},
-    "export": LOWER | {"browser", "methods", "training", "evaluation"},
+    "export": LOWER | {"browser", "glb", "methods", "training", "evaluation"},
     "capture": {"ops", "scene", "drawing", "data"},
     "cli": LOWER
     | {

@@ -7,18 +7,20 @@ forewarp-export writes a finished run for other programs, into its exports/<form
 What one types most:
   run=FOLDER                    the run (needed)
   format=ply                    particles for viewers of Gaussian splats, a file a time; voxels as points
+  format=glb                    particles with all of their motion, one small file (docs/format.md)
   format=mesh                   the surface with colours, by marching cubes, a file a time
   format=gltf                   moving points as an animation, one file
   format=html                   one page for a browser, without a server, with a time slider
   format=npz                    trajectories of points with what is visible of them, and the method's arrays
-  times=N times=[0,0.5]         how many, evenly spaced, or which
+  times=N times=[0,0.5]         how many, evenly spaced, or which; not of glb, which holds all
   out=FOLDER                    another folder
   degree=0|1|2|3                ply: how finely colours depend on direction
   up=world|y|-y|z               ply, mesh: which axis points upwards; -y for SuperSplat
   resolution=N level=SHARE      mesh: points of the lattice along the longest side; opacity of the surface
   files=ply|obj                 mesh: the files
   points=N                      gltf, npz, html of voxels: most points
-  seconds=N                     gltf, html: how long the animation lasts
+  quality=compact|lossless      glb: rounded to what an eye can tell, or in float32
+  seconds=N                     glb, gltf, html: how long the animation lasts
   megabytes=N                   html: most of the page; what does not fit is left out, and said
   views=N                       npz: cameras that tell which points are visible
   trust=[PACKAGE]               code of other packages that the run's config may name
@@ -88,6 +90,7 @@ def check(config) -> list[float]:
         raise ValueError(f"format: expected one of {', '.join(FORMATS)}, but got '{config.format}'")
     options = FORMATS[config.format].options
     foreign = {option for form in FORMATS.values() for option in form.options} - set(options)
+    foreign |= set() if FORMATS[config.format].times else {"times"}
     for key in map(key_of, typed_overrides()):
         if key in foreign:
             raise ValueError(

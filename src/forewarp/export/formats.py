@@ -19,24 +19,30 @@ _AXES = "the data's own world, right-handed, in its own unit of length; turned a
 
 class Format(NamedTuple):
     """A format ``x``, written by ``export_x`` of a ``module`` of this package with some ``options``; it may
-    need a ``package`` of an ``extra``.
+    need a ``package`` of an ``extra``, and is of some ``times`` unless it holds all.
     """
 
     module: str
     options: tuple[str, ...]
     package: str | None = None
     extra: str | None = None
+    times: bool = True
 
 
 FORMATS = {
     "ply": Format("ply", ("degree", "up")),
+    "glb": Format("glb", ("quality", "seconds"), times=False),
     "mesh": Format("ply", ("resolution", "level", "files", "up"), "skimage", "export"),
     "gltf": Format("tracks", ("points", "seconds")),
     "html": Format("html", ("points", "seconds", "megabytes"), "viser", "viewer"),
     "npz": Format("tracks", ("points", "views")),
 }
 # The values that an option may have: words, or numbers from a least to a most.
-CHOICES = {"files": ("ply", "obj"), "up": ("world", "y", "-y", "z")}
+CHOICES = {
+    "quality": ("compact", "lossless"),
+    "files": ("ply", "obj"),
+    "up": ("world", "y", "-y", "z"),
+}
 WHOLE_NUMBERS = {"degree": (0, 3), "resolution": (8, 512), "points": (1, 10**6), "views": (1, 100)}
 NUMBERS = {"level": (0.01, 0.99), "seconds": (0.1, 3600), "megabytes": (1, 1000)}
 
@@ -94,12 +100,13 @@ def write(
     require(kind)
     export = getattr(import_module(f"forewarp.export.{FORMATS[kind].module}"), f"export_{kind}")
     with folder_written_whole(folder, ABOUT) as part:
-        if kind != "mesh":  # which asks for matter alone
+        if kind not in ("mesh", "glb"):  # which ask for matter alone, and for particles
             source.check_tracks(kind)
         facts = export(source, part, progress, **options)
         files = sorted(file for file in part.rglob("*") if file.is_file())
         sizes = {file.relative_to(part).as_posix(): file.stat().st_size for file in files}
-        head = {"format": kind, **about, "times": list(source.times), "axes": _AXES}
+        times = {"times": list(source.times)} if FORMATS[kind].times else {}
+        head = {"format": kind, **about, **times, "axes": _AXES}
         content = head | facts | {"bytes": sizes}
         write_json(part / ABOUT, content)
     return content

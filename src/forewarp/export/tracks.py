@@ -6,8 +6,6 @@ makes them one binary glTF 2.0 file with an animation.
 
 from __future__ import annotations
 
-import json
-import struct
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,6 +17,7 @@ from torch import Tensor
 from forewarp.drawing.images import hidden
 from forewarp.evaluation.images import within
 from forewarp.evaluation.trajectories import seen_by, surface
+from forewarp.glb.container import UINT, Buffer
 from forewarp.methods.method import HasEllipsoids, HasMatter, HasTrajectories, Method
 from forewarp.scene.camera import Camera, mean_up
 from forewarp.scene.cloud import far_apart
@@ -73,14 +72,19 @@ class Source:
         before = mean_up(list(self.cameras)).numpy()
         return torch.from_numpy(Rotation.align_vectors([_UP[up]], [before])[0].as_matrix())
 
+    @property
+    def follows(self) -> bool:
+        """Whether ``tracks_of`` can follow the scene's points."""
+        points = isinstance(self.method, HasTrajectories) and isinstance(self.method, HasMatter)
+        return self.has_ellipsoids or points
+
     def check_tracks(self, kind: str) -> None:
         """Refuse a method that ``tracks_of`` cannot follow.
 
         Raises:
             ValueError: naming the format ``kind``.
         """
-        follows = isinstance(self.method, HasTrajectories) and isinstance(self.method, HasMatter)
-        if not self.has_ellipsoids and not follows:
+        if not self.follows:
             raise ValueError(
                 f"format={kind}: expected a method whose points can be followed, as particles, forward or "
                 f"backward, but got {self.model}"
@@ -226,38 +230,6 @@ _FACES = torch.tensor([[0, 1, 2], [0, 2, 3], [0, 3, 1], [1, 3, 2]])
 # A tetrahedron's radius is this share of the median distance of points to their fourth neighbour.
 _NEIGHBOUR, _RADIUS = 4, 0.8
 _MIN_COLOR_CHANGE = 1 / 255
-_FLOAT, _UINT = (5126, np.float32), (5125, np.uint32)  # glTF's component types
-_ELEMENTS = {1: "SCALAR", 3: "VEC3"}
-
-
-class Buffer:
-    """The one buffer of a glTF, with the accessors that describe the arrays in it."""
-
-    def __init__(self) -> None:
-        self.content, self.views, self.accessors = bytearray(), [], []
-
-    def add(self, values: Tensor | np.ndarray, component=_FLOAT, *, bounds: bool = False) -> int:
-        """Add (N,) or (N, 3) values; return the number of their accessor."""
-        number, dtype = component
-        array = np.ascontiguousarray(np.asarray(values), dtype)  # little-endian on all machines torch runs on
-        rows = array.reshape(len(array), -1)
-        accessor = {"bufferView": len(self.views), "componentType": number, "count": len(array)}
-        accessor["type"] = _ELEMENTS[rows.shape[1]]
-        if bounds:
-            accessor |= {"min": rows.min(0).tolist(), "max": rows.max(0).tolist()}
-        self.accessors.append(accessor)
-        self.views.append({"buffer": 0, "byteOffset": len(self.content), "byteLength": array.nbytes})
-        self.content += array.tobytes()
-        return len(self.accessors) - 1
-
-    def packed(self, description: dict) -> bytes:
-        """Return the binary container of a description and this buffer."""
-        content = description | {"buffers": [{"byteLength": len(self.content)}]}
-        text, binary = json.dumps(content, separators=(",", ":")).encode(), bytes(self.content)
-        text, binary = text + b" " * (-len(text) % 4), binary + b"\0" * (-len(binary) % 4)
-        chunks = (b"JSON", text), (b"BIN\0", binary)
-        body = b"".join(struct.pack("<I4s", len(chunk), kind) + chunk for kind, chunk in chunks)
-        return struct.pack("<4sII", b"glTF", 2, 12 + len(body)) + body
 
 
 def export_gltf(source: Source, folder: Path, progress: Progress, *, points: int, seconds: float) -> dict:
@@ -324,7 +296,7 @@ def glb(tracks: Tracks, radius: float, rotation: Tensor, seconds: float) -> byte
     buffer = Buffer()
     attributes = {"POSITION": buffer.add(corners[0], bounds=True), "COLOR_0": buffer.add(colors[0])}
     faces = (_FACES + 4 * torch.arange(len(tracks))[:, None, None]).flatten()
-    primitive = {"attributes": attributes, "indices": buffer.add(faces, _UINT), "material": 0}
+    primitive = {"attributes": attributes, "indices": buffer.add(faces, UINT), "material": 0}
     mesh, animation = {"primitives": [primitive]}, {}
     if total > 1:
         primitive["targets"] = targets = []
@@ -349,7 +321,5 @@ def glb(tracks: Tracks, radius: float, rotation: Tensor, seconds: float) -> byte
         "nodes": [{"mesh": 0, "rotation": quaternion, "name": "points"}],
         "meshes": [mesh],
         "materials": [unlit],
-        "accessors": buffer.accessors,
-        "bufferViews": buffer.views,
     }
     return buffer.packed(description | animation)

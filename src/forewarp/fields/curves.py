@@ -16,7 +16,7 @@ from forewarp.ops.grid import corner_weights, index_of, trilinear
 from forewarp.scene.box import Box, Lattice
 
 KINDS = ("spline", "cosines")
-_PADDING = 0.2  # of the sequence, imagined before and after it: a cosine stands still at both ends
+PADDING = 0.2  # of the sequence, imagined before and after it: a cosine stands still at both ends
 
 
 class Curve:
@@ -59,7 +59,7 @@ class Curve:
         """The basis (..., K) at a time in [0, 1]; a spline also takes times up to ``beyond`` outside."""
         if self.kind == "spline":
             return spline_basis(time, self.count, beyond=beyond, straight=self.straight)
-        return dct_basis(time, self.count, self.times, self.canonical_time, _PADDING)
+        return dct_basis(time, self.count, self.times, self.canonical_time, PADDING)
 
     def summed(self, parts: Sequence[tuple[float, float]], beyond: float = 0.0) -> Tensor:
         """``sum_i f_i b(t_i)`` (K,) of times and factors: a difference of bases, say, at one go."""

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from forewarp.fields.grids import VoxelGrid
+from forewarp.fields.moving import MovingGaussians
 from forewarp.ops.backend import is_number
 from forewarp.scene.box import Box, Lattice
 from forewarp.scene.cloud import Cloud, Ellipsoids, Handover
@@ -308,6 +309,14 @@ class HasEllipsoids(Protocol):
 
     def movement(self, times: Sequence[float]) -> dict[str, Tensor]:
         """Return, by name, what makes ``ellipsoids`` at T times of the ``template``, and its coefficients."""
+
+
+@runtime_checkable
+class HasMovingGaussians(Protocol):
+    """Be Gaussians that nodes with curves move, so that a file can hold all times of them."""
+
+    def moving(self) -> MovingGaussians:
+        """Return all of them, without gradients."""
 
 
 @runtime_checkable

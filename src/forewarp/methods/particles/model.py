@@ -12,6 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from forewarp.fields.curves import Curve
+from forewarp.fields.moving import MARGIN, nearest_shown
 from forewarp.losses import IMAGE_LOSSES, robust
 from forewarp.methods.method import Method, Snapshot, Start, Step
 from forewarp.methods.particles import density, queries
@@ -43,9 +44,6 @@ from forewarp.scene.cloud import Cloud
 from forewarp.scene.frame import Scene, spread
 from forewarp.scene.view import Asks, Batch, Moment, Observation, Rendering, View
 
-# Of the camera's near plane, and at least of its far plane: closer particles would fill the image.
-_NEAR, _LEAST_NEAR = 0.1, 0.02
-_MARGIN = 0.125  # share of the longer side; what projects farther outside the image is left out
 _LENS_MARGIN = 1.3  # of the squared distance from the axis that the image's border reaches
 _BORDER = 16  # points along each side of an image
 _TRANSPARENT = 1e-6  # opacity below which a pixel has no depth
@@ -72,10 +70,10 @@ def pinhole_of(camera: Camera, blur: float) -> Pinhole:
         (camera.fx, camera.fy),
         (camera.cx, camera.cy),
         (camera.width, camera.height),
-        max(_NEAR * camera.near, _LEAST_NEAR * camera.far),
+        nearest_shown(camera),
         skew=camera.skew,
         blur=blur,
-        margin=_MARGIN * max(camera.width, camera.height),
+        margin=MARGIN * max(camera.width, camera.height),
         radial=(0.0, 0.0, 0.0) if lens is None else lens.k,
         tangential=(0.0, 0.0) if lens is None else lens.p,
         reach=1e8 if lens is None else _squared_reach(camera),
@@ -157,6 +155,7 @@ class Particles(Method):
     # Scene queries: see ``methods.method``.
     matter, bounds, trajectories = queries.matter, queries.bounds, queries.trajectories
     ellipsoids, template, movement = queries.ellipsoids, queries.template, queries.movement
+    moving = queries.moving
 
     def __init__(self, start: Start, *, width: float = 0.05, blur: float = BLUR, **choices) -> None:
         super().__init__()

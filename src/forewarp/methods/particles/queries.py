@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from forewarp.fields.moving import MovingGaussians, NodeMotion
 from forewarp.methods.particles.density import most_opaque
 from forewarp.methods.particles.nodes import nearest
 from forewarp.ops.gaussians import FLAT, Warp, moved, rotations
@@ -91,6 +92,30 @@ def movement(self: Particles, times: Sequence[float]) -> dict[str, Tensor]:
             [self.opacity_basis(time) for time in times]
         )
     return {name: value.detach() for name, value in parts.items()}
+
+
+@torch.no_grad()
+def moving(self: Particles) -> MovingGaussians:
+    """See ``HasMovingGaussians``: all particles, in their order."""
+    motion, nodes = None, self.nodes
+    if nodes is not None:
+        offsets = nodes.time_offsets
+        times = [] if offsets is None else offsets.times
+        motion = NodeMotion(
+            nodes.positions,
+            nodes.translations.data,
+            None if nodes.rotations is None else nodes.rotations.data,
+            nodes.curve,
+            self.skinning.links,
+            self.skinning.weights(),
+            times,
+            [offsets(time) - time for time in times],
+        )
+    over_time = (self.color_over_time, self.opacity_over_time)
+    over_time = [None if part is None else part.data for part in over_time]
+    harmonics, opacity = template(self).harmonics, self.opacity.data[:, 0]
+    canonical = self.means.data, self.scales.data, self.quaternions.data, opacity, harmonics
+    return MovingGaussians(*canonical, *over_time, self.canonical_time, self.blur, motion)
 
 
 @torch.no_grad()

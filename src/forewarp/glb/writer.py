@@ -1,0 +1,294 @@
+"""Write moving Gaussians as a binary glTF: ``docs/format.md`` specifies what the reader beside this reads."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from forewarp.fields.curves import PADDING
+from forewarp.fields.moving import MARGIN, MovingGaussians, NodeMotion, nearest_shown
+from forewarp.glb import meshopt
+from forewarp.glb.container import (
+    BYTE,
+    COMPRESSION,
+    SHORT,
+    SIGNED_UNIT_SHORT,
+    UNIT_BYTE,
+    Buffer,
+)
+from forewarp.ops.gaussians import LEAST_LOG
+from forewarp.scene.camera import Camera
+
+SPLATS, MOTION = "KHR_gaussian_splatting", "FOREWARP_gaussian_motion"
+FORMAT = "1.0"
+COMPACT, LOSSLESS = "compact", "lossless"
+_LEAST_NEAR = 1e-6  # of a camera's far plane: glTF's near plane lies in front of the camera
+_SLOTS = 4  # links in an accessor
+_TIMES = 64  # at which opacity over time is looked at
+
+
+@dataclass(frozen=True)
+class Setting:
+    """What a page needs besides the Gaussians: ``cameras`` that have seen them, the first one to begin at;
+    the ``rotation`` (3, 3) that makes y point upwards; the ``focus`` (3,) to turn about, world units; how
+    many ``seconds`` time lasts from 0 to 1; and the ``background`` (3,), sRGB.
+    """
+
+    cameras: Sequence[Camera]
+    rotation: Tensor
+    focus: Tensor
+    seconds: float
+    background: tuple[float, float, float]
+
+
+def write(gaussians: MovingGaussians, setting: Setting, quality: str) -> bytes:
+    """Return the file.
+
+    Args:
+        gaussians: those whose opacity is ever seen are written, in the order of ``rows_in_file``.
+        setting: what else is in the file.
+        quality: ``compact``: rounded to what an eye can tell; ``lossless``: float32.
+    """
+    order, moving = rows_in_file(gaussians)
+    store = _Store(compact=quality == COMPACT)
+    buffer, steps = store.buffer, _Steps.of(gaussians, setting)
+    attributes = _attributes(store, steps, gaussians, order)
+    motion = {"version": FORMAT, "features": [], "canonicalTime": gaussians.canonical_time}
+    motion |= _setting(setting, gaussians) | _over_time(store, steps, gaussians, order) | {"moving": moving}
+    if gaussians.motion is not None:
+        motion |= _motion(store, steps, gaussians.motion, order[:moving])
+    splats = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display", "projection": "perspective"}
+    splats |= {"sortingMethod": "cameraDistance", "extensions": {MOTION: motion}}
+    primitive = {"mode": 0, "attributes": attributes, "extensions": {SPLATS: splats}}
+    cameras = [_camera(camera) for camera in setting.cameras]
+    nodes = [
+        {"name": "scene", "rotation": _quaternion(setting.rotation), "mesh": 0}
+        | {"children": list(range(1, len(cameras) + 1))}
+    ]
+    names = ["start", *(f"camera {number}" for number in range(1, len(cameras)))]
+    for number, (name, camera) in enumerate(zip(names, setting.cameras)):
+        pose = camera.camera_to_world[:3, :3].double() * torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64)
+        place = {"rotation": _quaternion(pose), "translation": camera.center.tolist()}
+        nodes.append({"name": name, "camera": number} | place)
+    description = {
+        "asset": {"version": "2.0", "generator": "forewarp"},
+        "extensionsUsed": [SPLATS, MOTION, *[COMPRESSION] * buffer.compressed],
+        **({"extensionsRequired": [COMPRESSION]} if buffer.compressed else {}),
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": nodes,
+        "cameras": cameras,
+        "meshes": [{"primitives": [primitive]}],
+    }
+    return buffer.packed(description)
+
+
+def _quaternion(rotation: Tensor) -> list[float]:
+    from scipy.spatial.transform import Rotation  # late, as its import takes time
+
+    return Rotation.from_matrix(rotation.numpy()).as_quat().tolist()  # x, y, z, w
+
+
+def _camera(camera: Camera) -> dict:
+    """Describe a camera as glTF does, and exactly in its extras."""
+    perspective = {
+        "yfov": 2 * math.atan(0.5 * camera.height / camera.fy),
+        "aspectRatio": camera.width * camera.fy / (camera.height * camera.fx),
+        "znear": max(camera.near, _LEAST_NEAR * camera.far),
+        "zfar": camera.far,
+    }
+    names = ("width", "height", "fx", "fy", "cx", "cy")
+    extras = {name: getattr(camera, name) for name in names}
+    if camera.skew:
+        extras["skew"] = camera.skew
+    if camera.lens is not None:
+        extras["lens"] = [*camera.lens.k, *camera.lens.p]
+    return {"type": "perspective", "perspective": perspective, "extras": extras}
+
+
+def _setting(setting: Setting, gaussians: MovingGaussians) -> dict:
+    start = setting.cameras[0]
+    return {
+        "seconds": setting.seconds,
+        "background": list(setting.background),
+        "focus": setting.focus.tolist(),
+        "near": nearest_shown(start),
+        "far": start.far,
+        "blur": gaussians.blur,
+        "cutoff": math.exp(LEAST_LOG),
+        "margin": MARGIN,
+    }
+
+
+def rows_in_file(gaussians: MovingGaussians) -> tuple[np.ndarray, int]:
+    """Return the rows that are written, in order, and how many of them move.
+
+    Those that are never more opaque than the cutoff are left out; those that move come first; those near each
+    other lie near each other.
+    """
+    logits = gaussians.opacity
+    if gaussians.opacity_over_time is not None:
+        times = torch.linspace(0, 1, _TIMES + 1)
+        bases = gaussians.cosines(times, gaussians.opacity_over_time.shape[1])
+        logits = (logits + bases @ gaussians.opacity_over_time.T).amax(0)
+    seen = (torch.nn.functional.logsigmoid(logits) > LEAST_LOG).numpy()
+    rests = np.ones(len(seen), bool)
+    if gaussians.motion is not None:
+        rests = ~(gaussians.motion.weights > 0).any(-1).numpy()
+    order = np.lexsort((morton(gaussians.means.numpy()), rests))
+    order = order[seen[order]]
+    return order, int((~rests[order]).sum())
+
+
+def morton(points: np.ndarray) -> np.ndarray:
+    """Return numbers (N,) in whose order points (N, 3) near each other lie near each other."""
+    low, high = points.min(0, initial=np.inf), points.max(0, initial=-np.inf)
+    side = max(float((high - low).max(initial=0)), 1e-30)
+    cells = ((points - low) / side * (2**21 - 1)).astype(np.uint64)
+    codes = np.zeros(len(points), np.uint64)
+    for bit in range(21):
+        for axis in range(3):
+            codes |= (cells[:, axis] >> np.uint64(bit) & np.uint64(1)) << np.uint64(3 * bit + axis)
+    return codes
+
+
+class _Store:
+    """Stores arrays in a buffer: ``compact`` ones rounded, others as float32."""
+
+    def __init__(self, *, compact: bool) -> None:
+        self.compact, self.buffer = compact, Buffer(compressed=compact)
+
+    def stepped(self, values: np.ndarray, step: float, **options) -> int:
+        """Store numbers in steps of the power of two at or below ``step``."""
+        return self._exponential(values, math.floor(math.log2(step)), **options)
+
+    def scaled(self, values: np.ndarray, bits: int, **options) -> int:
+        """Store numbers > 0 with ``bits`` of their own mantissa each."""
+        exponents = np.frexp(np.maximum(values, 2.0**meshopt.LEAST_EXPONENT))[1] - bits
+        return self._exponential(values, exponents, **options)
+
+    def _exponential(self, values: np.ndarray, exponents: np.ndarray | int, **options) -> int:
+        if not self.compact:
+            return self.buffer.add(values, **options)
+        elements = meshopt.exponential(values.reshape(len(values), -1), exponents)
+        decoded = meshopt.from_exponential(elements).reshape(values.shape)
+        return self.buffer.add(decoded, filtered=("EXPONENTIAL", elements), **options)
+
+    def quaternions(self, values: np.ndarray, bits: int, **options) -> int:
+        """Store unit quaternions (N, 4) x, y, z, w with ``bits`` a component."""
+        if not self.compact:
+            return self.buffer.add(values, **options)
+        elements = meshopt.quaternion(values, bits)
+        decoded = meshopt.from_quaternion(elements)
+        return self.buffer.add(decoded, SIGNED_UNIT_SHORT, filtered=("QUATERNION", elements), **options)
+
+    def shares(self, values: np.ndarray, **options) -> int:
+        """Store numbers in [0, 1]."""
+        if not self.compact:
+            return self.buffer.add(values, **options)
+        return self.buffer.add(np.rint(values * UNIT_BYTE.one), UNIT_BYTE, **options)
+
+
+@dataclass(frozen=True)
+class _Steps:
+    """How finely compact files store: ``length`` and ``curve`` in world units, others as they are."""
+
+    length: float
+    curve: float
+    gibbs: float = 2**-11
+    color: float = 2**-7
+    harmonic: float = 2**-6
+    logit: float = 2**-5
+    scale_bits: int = 6
+    rotation_bits: int = 8
+
+    @classmethod
+    def of(cls, gaussians: MovingGaussians, setting: Setting) -> _Steps:
+        """Choose lengths as shares of what a pixel of the cameras spans."""
+        pixel = _pixel(gaussians, setting.cameras)
+        return cls(length=pixel / 4, curve=pixel / 8)
+
+
+def _pixel(gaussians: MovingGaussians, cameras: Sequence[Camera]) -> float:
+    """Return how many world units a pixel spans, at the particles that cameras are nearest to."""
+    spans = []
+    for camera in cameras:
+        away = (gaussians.means.double() - camera.center).norm(dim=-1)
+        spans.append(float(away.quantile(0.05)) / max(camera.fx, camera.fy))
+    return max(min(spans), 1e-6 * cameras[0].far)
+
+
+def _attributes(store: _Store, steps: _Steps, gaussians: MovingGaussians, order: np.ndarray) -> dict:
+    """Store the canonical state as KHR_gaussian_splatting has it."""
+    rows = torch.from_numpy(order)
+    quaternions = _unit(gaussians.quaternions[rows].double())
+    opacity = torch.sigmoid(gaussians.opacity[rows].double()).numpy()
+    scales, vertices = gaussians.log_scales[rows].exp().numpy(), {"vertices": True}
+    attributes = {
+        "POSITION": store.stepped(gaussians.means[rows].numpy(), steps.length, bounds=True, **vertices),
+        f"{SPLATS}:ROTATION": store.quaternions(quaternions, steps.rotation_bits, **vertices),
+        f"{SPLATS}:SCALE": store.scaled(scales, steps.scale_bits, **vertices),
+        f"{SPLATS}:OPACITY": store.shares(opacity, **vertices),
+    }
+    for number, harmonic in enumerate(gaussians.harmonics[rows].unbind(1)):
+        degree = math.isqrt(number)
+        name = f"{SPLATS}:SH_DEGREE_{degree}_COEF_{number - degree**2}"
+        step = steps.harmonic if number else steps.color
+        attributes[name] = store.stepped(harmonic.numpy(), step, **vertices)
+    return attributes
+
+
+def _unit(quaternions: Tensor) -> np.ndarray:
+    """Turn quaternions w, x, y, z (N, 4) of any length into unit ones x, y, z, w; of length 0: the identity."""
+    length = quaternions.norm(dim=-1, keepdim=True)
+    identity = quaternions.new_tensor([1.0, 0.0, 0.0, 0.0])
+    return torch.where(length > 1e-12, quaternions / length.clamp(min=1e-12), identity).roll(-1, -1).numpy()
+
+
+def _over_time(store: _Store, steps: _Steps, gaussians: MovingGaussians, order: np.ndarray) -> dict:
+    """Store what time adds to colours and opacity; of the latter the logits, too, as 8 bits do not tell them."""
+    parts = {}
+    if gaussians.color_over_time is not None:
+        colors = gaussians.color_over_time[order].unbind(1)
+        parts["colorOverTime"] = [store.stepped(color.numpy(), steps.color) for color in colors]
+    if gaussians.opacity_over_time is not None:
+        logits = gaussians.opacity_over_time[order].unbind(1)
+        parts["opacityLogits"] = store.stepped(gaussians.opacity[order].numpy(), steps.logit)
+        parts["opacityOverTime"] = [store.stepped(logit.numpy(), steps.logit) for logit in logits]
+    return parts
+
+
+def _motion(store: _Store, steps: _Steps, motion: NodeMotion, rows: np.ndarray) -> dict:
+    """Store the nodes, and what the particles in ``rows`` follow."""
+    curve, count = motion.curve, motion.translations.shape[1]
+    nodes = {"positions": store.stepped(motion.positions.numpy(), steps.length)}
+    nodes["translations"] = store.stepped(motion.translations.reshape(-1, 3).numpy(), steps.curve)
+    if motion.rotations is not None:
+        nodes["rotations"] = store.stepped(motion.rotations.reshape(-1, 3).numpy(), steps.gibbs)
+    about = {"kind": curve.kind, "count": count, "frames": curve.times}
+    about |= {"natural": curve.straight} if curve.kind == "spline" else {"padding": PADDING}
+    parts = {"nodes": nodes, "curve": about}
+    if len(motion.times):
+        pair = {"times": motion.times, "offsets": motion.offsets}
+        parts["timeOffsets"] = {
+            name: store.buffer.add(np.array(numbers, np.float32)) for name, numbers in pair.items()
+        }
+    links, weights = _slots(motion.links.numpy()[rows], motion.weights.numpy()[rows])
+    component = BYTE if len(motion.positions) <= 256 else SHORT
+    for name, table, add in (
+        ("links", links, lambda part: store.buffer.add(part, component)),
+        ("weights", weights, store.shares),
+    ):
+        parts[name] = [add(table[:, first : first + _SLOTS]) for first in range(0, table.shape[1], _SLOTS)]
+    return parts
+
+
+def _slots(links: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return links and weights (N, S), S a multiple of 4: those that are left over are 0."""
+    width = ((0, 0), (0, -links.shape[1] % _SLOTS))
+    return np.pad(np.where(weights > 0, links, 0), width), np.pad(weights, width)
