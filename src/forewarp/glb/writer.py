@@ -244,14 +244,14 @@ def _attributes(store: _Store, steps: _Steps, gaussians: MovingGaussians, order:
 
 
 def _unit(quaternions: Tensor) -> np.ndarray:
-    """Turn quaternions w, x, y, z (N, 4) of any length into unit ones x, y, z, w; of length 0: the identity."""
+    """Turn quaternions w, x, y, z (N, 4) of any length into unit ones x, y, z, w; of length 0: identity."""
     length = quaternions.norm(dim=-1, keepdim=True)
     identity = quaternions.new_tensor([1.0, 0.0, 0.0, 0.0])
     return torch.where(length > 1e-12, quaternions / length.clamp(min=1e-12), identity).roll(-1, -1).numpy()
 
 
 def _over_time(store: _Store, steps: _Steps, gaussians: MovingGaussians, order: np.ndarray) -> dict:
-    """Store what time adds to colours and opacity; of the latter the logits, too, as 8 bits do not tell them."""
+    """Store what time adds to colours and opacity, and the logits it adds to, which 8 bits do not tell."""
     parts = {}
     if gaussians.color_over_time is not None:
         colors = gaussians.color_over_time[order].unbind(1)
