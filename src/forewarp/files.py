@@ -185,16 +185,32 @@ def load_json(path: Path) -> dict:
         OSError: where it cannot be read.
         ValueError: in one line, if the file is too large, does not parse or holds no object.
     """
-    raw = read_bytes(path)
+    text = decoded(read_bytes(path), path)
     try:
-        content = json.loads(raw.decode("utf-8-sig"))  # Windows begins a text with a byte order mark
+        content = json.loads(text)
     except json.JSONDecodeError as error:
         raise ValueError(f"{path}: line {error.lineno}: expected JSON, but got {error.msg}") from error
-    except (ValueError, RecursionError) as error:  # bytes that are no text, absurd numbers or nesting
+    except (ValueError, RecursionError) as error:  # absurd numbers or nesting
         raise ValueError(f"{path}: expected JSON, but got {short(str(error))}") from error
     if not isinstance(content, dict):
         raise ValueError(f"{path}: expected a JSON object at the top, but got {type(content).__name__}")
     return content
+
+
+def decoded(raw: bytes, path: Path) -> str:
+    """Decode the text of a file: UTF-8, or UTF-16 or UTF-32 as its first bytes tell.
+
+    Raises:
+        ValueError: naming the line of the first byte that is none, as of Latin-1.
+    """
+    try:
+        return raw.decode(json.detect_encoding(raw))
+    except UnicodeDecodeError as error:
+        line, byte = raw.count(b"\n", 0, error.start) + 1, raw[error.start]
+        raise ValueError(
+            f"{path}: line {line}: expected text in UTF-8, but got the byte 0x{byte:02x}, as of Latin-1; "
+            "save the file as UTF-8"
+        ) from error
 
 
 def read_rows(path: Path) -> list[dict[str, str]]:

@@ -275,9 +275,13 @@ def test_folders_that_are_no_capture_are_refused(tmp_path, count, odd, says):
         taken(tmp_path, tmp_path / "p")
 
 
-def test_images_that_nothing_here_reads_are_named(tmp_path):
-    (quarter(tmp_path / "p") / "IMG_1.HEIC").touch()
-    with pytest.raises(ValueError, match=r"IMG_1.HEIC: expected PNG or JPEG, but got HEIC; convert"):
+@pytest.mark.parametrize(
+    ("suffix", "said"),
+    [("HEIC", "HEIC; convert the pictures to JPEG, or set the phone"), ("webp", "WEBP; conv")],
+)
+def test_images_that_nothing_here_reads_are_named(tmp_path, suffix, said):
+    (quarter(tmp_path / "p") / f"IMG_1.{suffix}").touch()
+    with pytest.raises(ValueError, match=rf"IMG_1.{suffix}: expected PNG or JPEG, but got {said}"):
         taken(tmp_path, tmp_path / "p")
 
 

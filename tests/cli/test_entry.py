@@ -79,6 +79,11 @@ def test_options_of_ones_own_stand_beside_ours(ok, in_tmp):
         (["budget.minuts=1"], "got none of this name; did you mean budget.minutes?"),
         (["modle/view_dependence=sh"], "modle/view_dependence: expected a key of the configuration, but got"),
         (["--multirun", "seed=0,1", "model=forward,backward", "budgt=fast"], "did you mean budget?"),
+        (
+            ["data.scene=sc a,b"],
+            "data.scene: expected one value, but got sc a,b, which reads as several; add",
+        ),
+        (["data.scene=a,b"], """type a name that has a comma as "data.scene='a,b'\""""),
         (["data=[1"], "data=[1: no viable alternative at input '[1'"),
         (["budget.minutes=-1"], "budget.minutes: expected a number > 0 or null, but got -1"),
         (["model=forward", "+stage.coarse.bogus=1"], "stage.coarse: expected a key of num_voxels,"),

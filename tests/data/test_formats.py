@@ -116,7 +116,7 @@ BAD = {
     "dnerf": [
         (T, None, "expected a scene with transforms_train.json, but got none; scenes in .*: none"),
         (T, b'{\n"a": 1,\n}', "transforms_train.json: line 3: expected JSON, but got"),
-        (T, b"\xff\xfe\x00", "expected JSON, but got"),
+        (T, b"\xff\xfe\x00", "line 1: expected text in UTF-8, but got the byte 0x00"),
         (T, {"camera_angle_x": GONE}, "expected fl_x or camera_angle_x, but got neither"),
         (T, {"camera_angle_x": 0}, r"camera_angle_x: expected radians inside \(0, pi\)"),
         (T, {"frames": []}, "frames: expected a list of at least one frame"),

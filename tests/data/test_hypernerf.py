@@ -112,6 +112,15 @@ def test_no_item_leaves_the_scene(tmp_path):
         read_scene(tmp_path, "toy")
 
 
+def test_a_fisheye_is_named(tmp_path):
+    folder = write_rig(tmp_path / "toy")
+    edit(folder / "camera" / "left1_000000.json", {"camera_type": "fisheye"})
+    with pytest.raises(
+        SceneError, match="000.json: camera_type: expected a pinhole camera, but got 'fisheye'"
+    ):
+        read_scene(tmp_path, "toy")
+
+
 def test_intrinsics_of_larger_images_are_named(tmp_path):
     folder = write_rig(tmp_path / "toy", rig())
     for file in (folder / "camera").iterdir():

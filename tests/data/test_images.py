@@ -6,6 +6,7 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from forewarp.data.files import SceneError
 from forewarp.data.images import (
@@ -77,7 +78,7 @@ def test_header_and_pixels_of_a_jpeg(tmp_path, options):
 WHOLE = "expected a whole image, but got a truncated or harmed one"
 HARM = {  # of a PNG and of a JPEG
     "empty": (lambda c: b"", "but got an empty file"),
-    "text": (lambda c: b"version https://git-lfs", "expected a PNG or JPEG image, but got another kind"),
+    "text": (lambda c: b"version https://git-lfs", "got a pointer of Git LFS; fetch the file"),
     "signature only": (lambda c: c[:2], "but got another kind of file or a harmed header"),
     "in the header": (lambda c: c[:100], "but got"),
     "in the pixels": (lambda c: c[: len(c) // 2], WHOLE),
@@ -100,6 +101,14 @@ def test_bad_images_are_refused_in_one_line(tmp_path, name, harm):
         with pytest.raises(SceneError, match=rf"{name}: .*{match}") as caught:
             read(tmp_path / name)
         assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("kind", ["WebP", "TIFF", "GIF", "BMP"])
+def test_images_of_other_programs_are_named(tmp_path, kind):
+    Image.fromarray(NOISE).save(tmp_path / "a.png", format=kind)
+    said = f"a.png: expected a PNG or JPEG image, but got {kind}; convert it to PNG or JPEG"
+    with pytest.raises(SceneError, match=said):
+        inspect_image(tmp_path / "a.png")
 
 
 def test_other_kinds_of_pixel_are_refused(tmp_path):

@@ -130,6 +130,7 @@ def test_true_trajectories_keep_step_with_the_frames_that_are_read(tmp_path, fra
 
 INTRINSICS = {
     "a mark in front": lambda text: "\ufeff" + text,
+    "UTF-16": lambda text: text.encode("utf-16"),
     "one line a camera": lambda text: text.replace("\n\n", "|").replace("\n", " ").replace("|", "\n"),
     "all in one line": lambda text: " ".join(text.split()),
     "from 1": lambda text: re.sub(r"^(\d+)$", lambda m: str(int(m[1]) + 1), text, flags=re.MULTILINE),
@@ -141,7 +142,8 @@ INTRINSICS = {
 def test_intrinsics_by_others(toy, case):
     expected = [f.camera for f in read_scene(toy.parent, "toy", half_resolution=False).train]
     path = toy / "Intrinsic.inf"
-    path.write_text(INTRINSICS[case](path.read_text()), encoding="utf-8")
+    text = INTRINSICS[case](path.read_text())
+    path.write_bytes(text if isinstance(text, bytes) else text.encode())
     cameras = [f.camera for f in read_scene(toy.parent, "toy", half_resolution=False).train]
     assert [[getattr(c, k) for k in KEYS] for c in cameras] == [
         [getattr(c, k) for k in KEYS] for c in expected

@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 import shutil
 
 import numpy as np
@@ -36,6 +37,7 @@ def camera(stored=(80, 60), common=None, **own):
         ({"camera_angle_x": WIDE, "fl_x": 80.5}, 80.5, 80.5, 40),
         ({"fl_x": 90, "fl_y": 70, "cx": 50}, 90, 70, 50),
         ({"fl_x": 90, "common": {"camera_angle_x": WIDE}}, 90, 90, 40),  # a frame's own number wins
+        ({"camera_angle_y": 2 * math.atan(0.375)}, 80, 80, 40),  # of the height, where it stands alone
     ],
 )
 def test_one_reading_of_intrinsics(keys, fx, fy, cx):
@@ -63,6 +65,18 @@ def test_an_angle_of_upright_images_is_of_the_width_or_as_told():
             "distortion_params: expected a lens as k1 k2",
         ),
         ({}, "expected fl_x or camera_angle_x, but got neither"),
+        ({"camera_angle_y": 0.0}, r"camera_angle_y: expected radians inside \(0, pi\)"),
+        (
+            {"fl_x": 80, "lens_model": "OPENCV_FISHEYE"},
+            "lens_model: expected a pinhole camera, .*; undistort",
+        ),
+        (
+            {"fl_x": 80, "common": {"camera_type": "PANO"}},
+            r"json: camera_type: .*pinhole camera, but got 'PANO'",
+        ),
+        ({"fl_x": 80, "type": "equirectangular"}, r"\.type: expected a pinhole camera"),
+        ({"fl_x": 80, "projection": "ORTHO"}, "projection: expected a pinhole camera"),
+        ({"fl_x": 80, "fisheye": True}, "fisheye: expected a pinhole camera"),
     ],
 )
 def test_intrinsics_that_cannot_be_right_are_named(keys, said):
@@ -192,6 +206,11 @@ def test_times_that_miss_0_and_1_by_rounding_are_not_scaled():
             r"times of train frames: expected one .* 0 to 100, .* 0 to 1 \(train/0, ..",
         ),
         ([0, 50, 100], [0, 0.5, 1], "times of test frames: expected one unit .* write all times in one unit"),
+        (
+            [i / 9 for i in range(10)],
+            range(16),
+            r"times of train frames: expected one unit .* 0 to 15, but got 0 to 1 \(train/0",
+        ),
     ],
 )
 def test_times_in_two_units_are_refused(train, test, said):
@@ -209,6 +228,7 @@ def test_times_in_two_units_are_refused(train, test, said):
         (range(0, 3000, 33), [2901, 2934, 2967]),  # the last moments are tested on
         ([7, 7, 7], [0, 100]),
         ([0, 0.5, 1, 1.5, 3], [2]),
+        ([0, 0.4, 0.8, 1], [1.1, 1.2]),  # seconds
     ],
 )
 def test_times_in_one_unit_are_not_refused(train, test):
@@ -274,6 +294,47 @@ def test_images_with_and_without_alpha_are_not_mixed(tmp_path):
     write_dnerf(tmp_path / "toy")
     write_image(tmp_path / "toy" / "train" / "r_2.png", np.zeros((6, 8, 3), np.uint8))
     with pytest.raises(SceneError, match=r"in all images or in none, but got 1 of 9 without, as .*r_2.png"):
+        dnerf.read_scene(tmp_path, "toy")
+
+
+@pytest.mark.parametrize(
+    ("there", "said"),
+    [
+        ("R_1.PNG", r"left out \(r_1.png, ..\); train/R_1.PNG is there$"),
+        ("r_0001.png", "; train/r_0001.png is there$"),
+        ("r_1.webp", "; train/r_1.webp is there: convert it to PNG or JPEG$"),
+        ("r_12.png", r"left out \(r_1.png, ..\)$"),
+    ],
+)
+def test_a_missing_image_of_nearly_that_name_is_named(there, said, tmp_path):
+    folder = write_dnerf(tmp_path / "toy")
+    (folder / "train" / "r_1.png").rename(folder / "train" / there)
+    (line,) = dnerf.read_scene(tmp_path, "toy").protocol["assumed"]
+    assert re.search(said, line)
+
+
+def test_a_missing_folder_of_nearly_that_name_is_named(tmp_path):
+    folder = write_dnerf(tmp_path / "toy")
+    (folder / "train").rename(folder / "Train")
+    with pytest.raises(SceneError, match="got none of them; toy/Train is there"):
+        dnerf.read_scene(tmp_path, "toy")
+    (folder / "transforms_train.json").rename(folder / "Transforms_Train.json")
+    with pytest.raises(
+        SceneError, match="with transforms_train.json, but got none; toy/Transforms_Train.json is"
+    ):
+        dnerf.read_scene(tmp_path, "toy")
+
+
+@pytest.mark.parametrize("encoding", ["utf-16", "utf-16-le", "utf-32", "utf-8-sig"])
+def test_files_of_other_encodings_are_read_or_named(encoding, tmp_path):
+    file = write_dnerf(tmp_path / "toy") / "transforms_train.json"
+    text = file.read_text().replace("{", '{\n"author": "José", ', 1)
+    file.write_bytes(text.encode(encoding))
+    assert len(dnerf.read_scene(tmp_path, "toy").train) == 4
+    file.write_bytes(text.encode("latin-1"))
+    with pytest.raises(
+        SceneError, match="train.json: line 2: expected text in UTF-8, .* 0xe9, as of Latin-1; sav"
+    ):
         dnerf.read_scene(tmp_path, "toy")
 
 

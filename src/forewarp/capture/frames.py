@@ -20,6 +20,7 @@ import numpy as np
 import torch
 from torch.nn.functional import adaptive_max_pool2d, interpolate
 
+from forewarp.data.files import UNREAD
 from forewarp.data.images import SUFFIXES, common_header, in_order, read_image, write_image
 from forewarp.data.transforms import times_of
 from forewarp.drawing.images import at_most
@@ -259,15 +260,19 @@ def _images_in(folder: Path, deep: bool = False) -> list[Path]:
     dot beside them, which are none.
 
     Raises:
-        ValueError: for images of HEIC, which nothing here reads.
+        ValueError: for images of HEIC, WebP and others that nothing here reads; of subfolders, where there
+            are no others.
     """
     files = [p for p in folder.glob("**/*" if deep else "*") if not is_hidden(p.relative_to(folder))]
-    if heic := sorted(p for p in files if p.suffix.lower() in (".heic", ".heif")):
+    images = [p for p in files if p.suffix.lower() in SUFFIXES]
+    others = sorted(p for p in files if p.suffix.lower() in UNREAD)
+    if others and not (deep and images):
+        kind = others[0].suffix[1:].upper()
+        advice = ", or set the phone's camera to its most compatible format" if kind[:3] == "HEI" else ""
         raise ValueError(
-            f"{heic[0]}: expected PNG or JPEG, but got HEIC; convert the pictures to JPEG, or set the "
-            "phone's camera to its most compatible format"
+            f"{others[0]}: expected PNG or JPEG, but got {kind}; convert the pictures to JPEG{advice}"
         )
-    return in_order(p for p in files if p.suffix in SUFFIXES)
+    return in_order(images)
 
 
 def is_hidden(path: Path) -> bool:

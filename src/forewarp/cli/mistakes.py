@@ -148,6 +148,13 @@ def one_line(error: BaseException) -> str | None:
         otherwise = ", or use launcher=local" if kind == "launcher" else ""
         expected = f"{kind}: expected the package of hydra/{kind}={plugin}, but got none"
         return f"{expected}; install forewarp[sweeps]{otherwise}"
+    several = re.match(r"Ambiguous value for argument '([^=]+)=(.*)'", str(error))
+    if several and isinstance(error, HydraException):
+        key, value = several.groups()
+        return (
+            f"{key}: expected one value, but got {value}, which reads as several; add --multirun for a job "
+            f"of each, or type a name that has a comma as \"{key}='{value}'\""
+        )
     if isinstance(error, HydraException | OmegaConfBaseException):
         cause = error.__cause__
         detail = f" ({flat(str(cause))})" if isinstance(cause, OmegaConfBaseException) else ""

@@ -36,7 +36,17 @@ from forewarp.data.cameras import (
     space_of,
 )
 from forewarp.data.directions import check_directions
-from forewarp.data.files import MARKERS, frames_of, mismatch, number, read_json, remove, scene_folder, whole
+from forewarp.data.files import (
+    MARKERS,
+    frames_of,
+    mismatch,
+    nearly,
+    number,
+    read_json,
+    remove,
+    scene_folder,
+    whole,
+)
 from forewarp.data.images import StoredImage, alpha_of, by, check_pixels, inspect_image, write_image
 from forewarp.data.transforms import (
     camera_of,
@@ -305,7 +315,7 @@ def _read_file(
         if "depth_file_path" in entry.own:
             file, scale = entry.path("depth_file_path"), entry.get("depth_scale")
             if not os.path.isfile(file):
-                raise mismatch(entry.where("depth_file_path"), "an existing file", file)
+                raise mismatch(entry.where("depth_file_path"), "an existing file", file, nearly(file))
             depth = file, None if scale is None else entry.number("depth_scale", 1e-12, 1e6)
         if ability not in (*ABILITIES, "all"):
             raise mismatch(entry.where("ability"), f"one of {', '.join(ABILITIES)}", short(ability))
@@ -316,7 +326,8 @@ def _read_file(
         has_alpha = header.has_alpha or mask is not None
         pose = pose_in(entry, axes, inverse)
         camera = camera_of(entry, header.size, 1, image, pose=pose, longer=longer)
-        by_angle = entry.get("fl_x") is None and entry.get("fl_y") is None
+        by_angle = entry.get("camera_angle_x") is not None
+        by_angle &= entry.get("fl_x") is None and entry.get("fl_y") is None
         records.append(_Record(time_in(entry), camera, image, has_alpha, mask, depth, ability, by_angle))
     return records, assumed + left_aside(zip((entry for entry, _ in there), (r.camera for r in records)))
 

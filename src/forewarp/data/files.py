@@ -8,7 +8,7 @@ import operator
 import os
 import re
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from math import inf, isfinite
 from pathlib import Path
@@ -37,6 +37,19 @@ LAYOUTS = {  # what people call a layout: a file or folder that tells it, and wh
         "a transforms.json with a time in each frame; no reader knows it",
     ),
 }
+UNREAD = {
+    ".webp",
+    ".tif",
+    ".tiff",
+    ".heic",
+    ".heif",
+    ".avif",
+    ".bmp",
+    ".gif",
+    ".jxl",
+    ".jp2",
+    ".exr",
+}  # of images
 RECORD = "synthesis.json"  # of every synthesised scene, or folder of them
 LOCK = ".lock"  # of every folder of a run
 _UNPRINTABLE = {"Cc", "Cs", "Zl", "Zp"}  # control characters, surrogates, line and paragraph separators
@@ -70,9 +83,30 @@ def opened(path: Path, most: int = MOST_BYTES, what: str = "a readable file") ->
         with path.open("rb") as stream:
             yield stream
     except OSError as error:
-        raise mismatch(path, what, error.strerror or error) from error
+        advice = nearly(path) if isinstance(error, FileNotFoundError) else ""
+        raise mismatch(path, what, error.strerror or error, advice) from error
     except ValueError as error:
         raise error if isinstance(error, SceneError) else SceneError(str(error)) from error
+
+
+def nearly(path: Path) -> str:
+    """Say which file or folder is there in place of a missing one, whose name differs by case, by its suffix
+    or by zeros in front of numbers; nothing where there is none.
+    """
+    if not path.parent.is_dir():
+        return nearly(path.parent) if path.parent != path else ""
+
+    def core(name: str) -> str:
+        stem = re.sub(r"(\.[a-z]\w{2,4})+$", "", name.casefold())
+        return re.sub(r"\d+", lambda digits: digits[0].lstrip("0"), stem)
+
+    there = []
+    with suppress(OSError):  # a folder that may not be listed
+        there = sorted(name for name in os.listdir(path.parent) if core(name) == core(path.name))
+    if not there:
+        return ""
+    advice = ": convert it to PNG or JPEG" if Path(there[0]).suffix.lower() in UNREAD else ""
+    return f"{path.parent.name}/{there[0]} is there{advice}"
 
 
 def read_bytes(path: Path, most: int = MOST_BYTES) -> bytes:
@@ -228,6 +262,7 @@ def scene_folder(root: str | Path, scene: str, reader: str) -> Path:
     if not root.is_dir():
         raise mismatch("data.root", "an existing folder", root, "set data.root")
     if not scene or not (root / scene / marker).is_file():
+        file = root / scene / marker
         there = ", ".join(sorted(p.name for p in root.iterdir() if (p / marker).is_file())) or "none"
         advice = f"scenes in {root}: {there}"
         if scene and (other := layout_of(root / scene)):
@@ -237,6 +272,7 @@ def scene_folder(root: str | Path, scene: str, reader: str) -> Path:
         if (root / marker).is_file():
             folder = root.resolve()
             advice = f"did you mean data.root={folder.parent} data.scene={folder.name}?"
+        advice = (scene and file.parent.is_dir() and nearly(file)) or advice
         raise mismatch(root / scene, f"a scene with {marker}", "none", advice)
     return root / scene
 

@@ -35,7 +35,7 @@ from forewarp.data.cameras import (
 from forewarp.data.directions import opposite, other_readings
 from forewarp.data.files import Entry, inside, mismatch, number, read_json, remove, scene_folder, whole
 from forewarp.data.images import StoredImage, check_pixels, inspect_image, write_image
-from forewarp.data.transforms import with_images, with_suffix
+from forewarp.data.transforms import check_pinhole, with_images, with_suffix
 from forewarp.files import write_json
 from forewarp.scene.camera import Camera, Lens
 from forewarp.scene.frame import Frame, Scene, Truth, middle_of
@@ -207,6 +207,7 @@ def read_camera(path: Path, near: float, far: float) -> Camera:
             that cannot be undone.
     """
     entry = Entry(path, read_json(path))
+    check_pinhole(entry)
     width, height = entry.numbers("image_size", 2, 1, _MOST_PIXELS)
     if width % 1 or height % 1:
         raise mismatch(entry.where("image_size"), "whole numbers", f"{width:g} x {height:g}")

@@ -27,6 +27,18 @@ from forewarp.scene.frame import spread
 SUFFIXES = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")
 _FORMATS = ("PNG", "JPEG")
 _MOST_PIXELS = 80_000_000  # Pillow warns a little above
+_OTHER_KINDS = {  # at which byte, which marks tell them
+    "WebP": (8, b"WEBP"),
+    "TIFF": (0, (b"II*\0", b"MM\0*", b"II+\0")),
+    "GIF": (0, b"GIF8"),
+    "BMP": (0, b"BM"),
+    "AVIF": (4, b"ftypavi"),
+    "HEIC": (4, (b"ftyphei", b"ftyphev", b"ftypmif", b"ftypmsf")),
+    "JPEG 2000": (4, b"jP  "),
+    "JPEG XL": (0, (b"\xff\x0a", b"\0\0\0\x0cJXL ")),
+    "OpenEXR": (0, b"v/1\x01"),
+    "Radiance HDR": (0, b"#?R"),
+}
 _ORIENTATION = 0x0112  # EXIF's tag
 _JPEG_END, _JPEG_TAIL = b"\xff\xd9", 4096  # some cameras write a little behind the end
 _LEAST_HIDDEN, _COLORS = 0.01, 64  # share of an image, and colours, that tell an image beneath
@@ -409,11 +421,10 @@ def _inspect(stream: BinaryIO, path: Path, mode: str = "RGBA") -> Header:
     except (Image.DecompressionBombWarning, Image.DecompressionBombError) as error:
         raise mismatch(path, few_pixels, "more") from error
     except Exception as error:  # OSError, ValueError and more
-        got = str(error)
+        got, advice = str(error), ""
         if isinstance(error, UnidentifiedImageError):
-            is_empty = not stream.seek(0, os.SEEK_END)
-            got = "an empty file" if is_empty else "another kind of file or a harmed header"
-        raise mismatch(path, "a PNG or JPEG image", got) from error
+            got, advice = _kind_of(stream)
+        raise mismatch(path, "a PNG or JPEG image", got, advice) from error
     if not 0 < image.width * image.height <= _MOST_PIXELS:
         raise mismatch(path, few_pixels, by(image.size))
     has_16_bits = ";16" in str(image.tile[0][3])  # the mode alone hides it
@@ -430,6 +441,18 @@ def _inspect(stream: BinaryIO, path: Path, mode: str = "RGBA") -> Header:
     if not is_whole:
         raise mismatch(path, "a whole image", "a truncated or harmed one", "copy the file again")
     return header
+
+
+def _kind_of(stream: BinaryIO) -> tuple[str, str]:
+    """Say what a file is that is no PNG or JPEG, by its first bytes, and what to do."""
+    stream.seek(0)
+    head = stream.read(32)
+    if head.startswith(b"version https://git-lfs"):
+        return "a pointer of Git LFS", "fetch the file with git lfs pull"
+    for kind, (at, marks) in _OTHER_KINDS.items():
+        if head[at:].startswith(marks):
+            return kind, "convert it to PNG or JPEG"
+    return "another kind of file or a harmed header" if head else "an empty file", ""
 
 
 def _is_turned(image: Image.Image) -> bool:

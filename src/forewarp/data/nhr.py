@@ -20,9 +20,9 @@ import torch
 from forewarp.data.arrays import read_cloud, read_truth, shortened, write_array, write_truth
 from forewarp.data.cameras import box_of, check_middle, pose_of
 from forewarp.data.directions import inverted, opposite, other_readings
-from forewarp.data.files import SceneError, mismatch, numbers_of, read_bytes, remove, scene_folder, whole
+from forewarp.data.files import SceneError, mismatch, numbers_of, opened, remove, scene_folder, whole
 from forewarp.data.images import StoredImage, by, check_pixels, inspect_image, write_image
-from forewarp.files import replace_file
+from forewarp.files import decoded, replace_file
 from forewarp.scene.box import Box
 from forewarp.scene.camera import Camera
 from forewarp.scene.frame import Frame, Scene, Truth
@@ -216,7 +216,8 @@ def _read_intrinsics(path: Path) -> list[np.ndarray]:
 
 def _lines(path: Path) -> list[tuple[int, list[str]]]:
     """List the lines that are not blank: their numbers from 1 and their words."""
-    text = read_bytes(path).decode("utf-8-sig", errors="replace")
+    with opened(path) as stream:
+        text = decoded(stream.read(), path)
     lines = [(n, line.split()) for n, line in enumerate(text.split("\n"), 1) if line.strip()]
     if not lines:
         raise mismatch(path, "at least one camera", "an empty file")

@@ -1,8 +1,9 @@
 """Read what the frames of every ``transforms*.json`` have in common, whatever its layout.
 
-Intrinsics are ``fl_x fl_y cx cy w h k1 k2 k3 p1 p2 camera_model`` or ``camera_angle_x``, at the top of the
-file or in a frame. A pose is camera-to-world with OpenGL's axes (x right, y up, looking along -z), unless the
-caller says otherwise. What a file leaves open is assumed here, in one way, and told in a line.
+Intrinsics are ``fl_x fl_y cx cy w h k1 k2 k3 p1 p2 camera_model``, ``camera_angle_x`` or ``camera_angle_y``
+alone, at the top of the file or in a frame. A pose is camera-to-world with OpenGL's axes (x right, y up,
+looking along -z), unless the caller says otherwise. What a file leaves open is assumed here, in one way, and
+told in a line.
 """
 
 from __future__ import annotations
@@ -19,21 +20,37 @@ import numpy as np
 import torch
 
 from forewarp.data.cameras import FLIP, check_lens, check_middle, pose_of
-from forewarp.data.files import Entry, mismatch
+from forewarp.data.files import Entry, mismatch, nearly
 from forewarp.data.images import SUFFIXES, by, in_order
 from forewarp.scene.camera import Camera, Lens
 
 Thing = TypeVar("Thing")
 MODELS = ("OPENCV", "PINHOLE", "RADIAL", "SIMPLE_RADIAL", "SIMPLE_PINHOLE")
 AXES = ("opengl", "opencv")
-# Keys of instant-ngp that say that the lens is none of these, whatever k1 .. say.
-_OTHER_LENSES = ("is_fisheye", "ftheta_p0", "latlong", "equirectangular")
+# Keys of programs that say that the lens is none of these, whatever k1 .. say, or say which it is.
+_OTHER_LENSES = (
+    "is_fisheye",
+    "fisheye",
+    "ftheta_p0",
+    "latlong",
+    "equirectangular",
+    "panorama",
+    "orthographic",
+)
+_NAMES_LENS = re.compile(
+    r"((camera|lens|distortion|projection)_?)?(model|type|projection|lens)", re.IGNORECASE
+)
+_NO_PINHOLE = re.compile(
+    "fish|equi(dist|rect|sol)|pano|spheric|omnidir|ortho|lat_?long|cylind|kannala|thin_?prism|ftheta",
+    re.IGNORECASE,
+)
 _UNREAD_LENSES = ("distortion_params", "distortion", "dist_coeffs", "distortion_coefficients", "dist")
 _FOCAL = ("fl_x", "fl_y", "camera_angle_x")
 _SAME_FOCAL = 0.02  # share by which two focal lengths of one camera may differ
 _OUTSIDE = 0.9  # share of a side beyond which a principal point is another image's
 _MOST_TIME = 1e20
 _LEAST_SPAN, _MOST_FAR = 0.05, 0.1  # of all times: less is hardly what was meant; share that may be wrong
+_LEAST_UNIT = 0.5  # of all times, that those in [0, 1] span
 _ROUNDING = 1e-6  # beyond 0 and 1
 _CAMERA_WORDS = re.compile(r"(cam|camera|view|sensor|c|v)[_-]?$", re.IGNORECASE)
 
@@ -62,14 +79,10 @@ def camera_of(
             with Brown's distortion or cannot be undone, and for intrinsics of a larger image.
     """
     model = entry.get("camera_model", "OPENCV")
-    for key in _OTHER_LENSES:
-        if entry.get(key) not in (None, False, 0):
-            raise mismatch(
-                entry.where(key), "a pinhole camera", short(entry.get(key)), "undistort the images"
-            )
     if model not in MODELS:
         expected = f"one of {', '.join(MODELS)}"
         raise mismatch(entry.where("camera_model"), expected, short(model), "undistort the images")
+    check_pinhole(entry)
     sizes = [entry.number(key, 1, 1e6, n * scale) for key, n in zip("wh", stored)]
     if any(abs(n - size / scale) >= 1 for n, size in zip(stored, sizes)):
         expected = " x ".join(f"{size / scale:g}" for size in sizes)
@@ -99,17 +112,37 @@ def camera_of(
     return camera
 
 
+def check_pinhole(entry: Entry) -> None:
+    """Refuse a camera whose file says that it is a fisheye, a panorama or orthographic, as programs write it.
+
+    Raises:
+        SceneError: naming the key.
+    """
+    for key, value in {**entry.common, **entry.own}.items():
+        is_other = key in _OTHER_LENSES and value not in (None, False, 0)
+        if isinstance(value, str) and _NAMES_LENS.fullmatch(key):
+            is_other = _NO_PINHOLE.search(value) is not None
+        if is_other:
+            raise mismatch(entry.where(key), "a pinhole camera", short(value), "undistort the images")
+
+
 def _focal(entry: Entry, width: int, height: int, longer: bool) -> float:
-    """Return the horizontal focal length in pixels, from ``fl_x``, ``fl_y`` or ``camera_angle_x``."""
-    angle, least, most = entry.get("camera_angle_x"), 0.01 * width, 100 * width
+    """Return the horizontal focal length in pixels, from ``fl_x``, ``fl_y``, ``camera_angle_x`` or, where it
+    stands alone, ``camera_angle_y``.
+    """
+    least, most = 0.01 * width, 100 * width
     named = next((key for key in ("fl_x", "fl_y") if entry.get(key) is not None), None)
+    across = "camera_angle_x" if entry.get("camera_angle_x") is not None or named else "camera_angle_y"
+    angle = entry.get(across)
     if named is None and angle is None:
         raise mismatch(entry.where("fl_x"), "fl_x or camera_angle_x", "neither")
     if angle is not None:
-        angle = entry.number("camera_angle_x", 0, math.pi)
+        angle = entry.number(across, 0, math.pi)
         if angle in (0, math.pi):
-            raise mismatch(entry.where("camera_angle_x"), "radians inside (0, pi)", angle)
+            raise mismatch(entry.where(across), "radians inside (0, pi)", angle)
     half = None if angle is None else 2 * math.tan(0.5 * angle)
+    if across == "camera_angle_y":
+        return height / half
     if named is None:
         return (max(width, height) if longer else width) / half
     focal = entry.number(named, least, most)
@@ -206,10 +239,12 @@ def with_images(things: Sequence[Thing], images: Sequence[Path], where: str) -> 
     if all(there):
         return list(things), []
     missing = images[there.index(False)]
+    instead = nearly(missing)
     if not any(there):
-        raise mismatch(where, f"the images that it lists, as {missing}", "none of them")
+        raise mismatch(where, f"the images that it lists, as {missing}", "none of them", instead)
     count = f"{there.count(False)} of {len(there)}"
     line = f"{where}: {count} images are not there and left out ({missing.name}, ..)"
+    line += f"; {instead}" if instead else ""
     return [thing for thing, is_there in zip(things, there) if is_there], [line]
 
 
@@ -274,17 +309,18 @@ def check_times(splits: Mapping[str, Mapping[str, float | None]], where: str) ->
 
     Raises:
         SceneError: naming a frame, where times are to be scaled to [0, 1] and three or more would span next
-            to nothing: all but the farthest, those of training, or a split's that lie in [0, 1].
+            to nothing, all but the farthest or those of training, or a split's that lie in [0, 1] less than
+            half of it.
     """
     named = {name: time for times in splits.values() for name, time in times.items()}
     if None in named.values() or _within_unit(named.values()):
         return
     times = sorted({*named.values()})
-    least = _LEAST_SPAN * (times[-1] - times[0])
+    whole = times[-1] - times[0]
     advice = "write all times in one unit, or from 0 to 1"
 
-    def is_squeezed(some: Iterable[float]) -> bool:
-        return len({*some}) > 2 and max(some) - min(some) < least
+    def is_squeezed(some: Iterable[float], least: float = _LEAST_SPAN) -> bool:
+        return len({*some}) > 2 and max(some) - min(some) < least * whole
 
     middle = times[len(times) // 2]
     *rest, far = sorted(times, key=lambda time: abs(time - middle))
@@ -295,7 +331,8 @@ def check_times(splits: Mapping[str, Mapping[str, float | None]], where: str) ->
         raise mismatch(f"{where}: time of {name}", expected, f"{far:.10g}", advice)
     for split, of in splits.items():
         some = of.values()
-        if is_squeezed(some) and (split == "train" or _within_unit(some)):
+        in_unit = _within_unit(some)
+        if (split == "train" and is_squeezed(some)) or (in_unit and is_squeezed(some, _LEAST_UNIT)):
             expected = f"one unit in all splits, which have {times[0]:.10g} to {times[-1]:.10g}"
             got = f"{min(some):.10g} to {max(some):.10g} ({next(iter(of))}, ..)"
             raise mismatch(f"{where}: times of {split} frames", expected, got, advice)
