@@ -69,7 +69,7 @@ def test_what_fits_together_is_not_doubted(tmp_path):
         (changed(box=Box((-0.1, -0.1, -0.1), (0.1, 0.1, 0.1))), r"\d\d% of the subject's pixels see nothing"),
         (
             changed(with_alpha(lambda alpha: 255 - alpha)),
-            "in 8 of 8 .* fills all edges, as if alpha or masks",
+            "in 8 of 8 .* fills the edges and not the middle, as if alpha or masks",
         ),
         (changed(with_alpha(lambda alpha: alpha * 0 + 255)), "alpha is opaque in all training images"),
         (changed(still=torch.full((4, 3), 500.0)), "cameras see 0% of the 4 points that never move"),
@@ -77,6 +77,34 @@ def test_what_fits_together_is_not_doubted(tmp_path):
 )
 def test_what_contradicts_itself_is_told(scene, said):
     assert any(re.search(said, line) for line in remarks(scene))
+
+
+def torso(rows, columns):
+    """A silhouette (H, W) that fills shares of the rows and columns, by their ends."""
+    row, column = ((torch.arange(30) + 0.5) / 30).expand(2, 30, 30)
+    row = row.T
+    inside = (row > rows[0]) & (row < rows[1]) & (column > columns[0]) & (column < columns[1])
+    return inside.byte() * 255
+
+
+def said_of(alpha):
+    """What is said of a scene all of whose images have one alpha (30, 30)."""
+    rgba = alpha[..., None].repeat(1, 1, 4)
+    train = [replace(f, camera=f.camera.resized(30, 30), load=lambda: rgba) for f in SCENE.train]
+    return "; ".join(remarks(replace(SCENE, train=tuple(train))))
+
+
+@pytest.mark.parametrize(
+    "subject", [torso((0.2, 1), (0.25, 0.75)), torso((0, 1), (0.2, 0.7)), torso((0, 1), (0.05, 0.95))]
+)
+def test_inverted_masks_of_a_subject_that_crosses_the_edges_are_told(subject):
+    assert "alpha or masks were inverted" in said_of(255 - subject)
+    assert "inverted" not in said_of(subject)
+
+
+@pytest.mark.parametrize("aside", [((0, 1), (0, 0.33)), ((0, 1), (0.6, 1)), ((0.6, 1), (0, 1))])
+def test_a_subject_at_one_side_is_not_taken_for_inverted(aside):
+    assert "inverted" not in said_of(torso(*aside))
 
 
 def test_images_without_a_subject_are_refused_and_few_of_them_told():

@@ -17,6 +17,10 @@ from forewarp.scene.frame import Scene, sightings, spread
 _LOOKED_AT = 8  # training images whose alpha is looked at
 _PIXELS = 4000  # of each
 _EDGE, _LEFT_OUT = 0.9, 0.02  # shares of an inverted image: subject along its edges, background at least
+_SIDE, _HOLLOW = (
+    0.5,
+    0.33,
+)  # of one whose subject crosses the edges: at two opposite sides, in its middle ninth
 _WITHIN = 5  # points along a side of the box that cameras are asked for
 _FAINT = 8  # of 255: alpha that is nowhere above it was written as 0 and 1
 _CUT_OFF, _FEW = 0.1, 0.5  # share of the subject beyond the box; of pixels and points that is too few
@@ -131,8 +135,8 @@ def _silhouettes(scene: Scene, *, bounded: bool) -> Iterator[str]:
     turned = [_is_inverted(mask) for mask in solid]
     if sum(turned) > _FEW * len(frames):
         yield (
-            f"in {sum(turned)} of {len(frames)} training images looked at the subject fills all edges, as if "
-            "alpha or masks were inverted; invert them"
+            f"in {sum(turned)} of {len(frames)} training images looked at the subject fills the edges and "
+            "not the middle, as if alpha or masks were inverted; invert them"
         )
         bounded = False  # what is solid is not the subject
     if not bounded:
@@ -150,9 +154,16 @@ def _silhouettes(scene: Scene, *, bounded: bool) -> Iterator[str]:
 
 
 def _is_inverted(solid: Tensor) -> bool:
-    """Tell whether a silhouette (H, W) fills the image's edges and leaves something else out."""
-    edges = torch.cat([solid[0], solid[-1], solid[:, 0], solid[:, -1]]).float()
-    return float(edges.mean()) > _EDGE and float(solid.float().mean()) < 1 - _LEFT_OUT
+    """Tell whether a silhouette (H, W) fills the image's edges and leaves something else out, or half of two
+    opposite edges and hardly the middle, which cameras look at.
+    """
+    edges = [solid[0], solid[-1], solid[:, 0], solid[:, -1]]
+    if float(torch.cat(edges).float().mean()) > _EDGE:
+        return float(solid.float().mean()) < 1 - _LEFT_OUT
+    top, bottom, left, right = (float(edge.float().mean()) for edge in edges)
+    (height, width), side = (n // 3 for n in solid.shape), max(min(top, bottom), min(left, right))
+    middle = solid[height : solid.shape[0] - height, width : solid.shape[1] - width]
+    return side > _SIDE and float(middle.float().mean()) < _HOLLOW
 
 
 def meets(camera: Camera, box: Box, pixels: Tensor) -> Tensor:
