@@ -11,7 +11,7 @@ from scipy.ndimage import gaussian_filter
 
 pytest.importorskip("pycolmap", reason="no pycolmap; make install adds it")
 
-from forewarp.capture.frames import Source, edge_width, extracted, measure, sharpest, sharpness, take
+from forewarp.capture.frames import Source, bars_of, edge_width, extracted, measure, sharpest, sharpness, take
 from forewarp.capture.poses import BLURRED
 from tests.support.films import numbered, write_film
 
@@ -184,6 +184,42 @@ def test_frames_bear_their_numbers_and_stamps_and_are_taken_once(tmp_path):
         assert number_of(np.asarray(Image.open(frames.folder / name))) == n
     film.unlink()
     assert taken(tmp_path, film) == frames
+
+
+@pytest.mark.parametrize("rotation", [0, 90])
+def test_black_bars_are_cut_off_and_told(tmp_path, rotation):
+    """A checkerboard that shifts, with bars of 12 rows above and below."""
+    row, column = np.mgrid[:72, :128] // 8
+    frames = np.stack([np.where((row + column + n // 4) % 2, 220, 30) for n in range(16)])
+    frames = np.repeat(frames.astype(np.uint8)[..., None], 3, -1)
+    film = write_film(
+        tmp_path / "a.mp4", np.pad(frames, ((0, 0), (12, 12), (0, 0), (0, 0))), rotation=rotation
+    )
+    images = taken(tmp_path, film)
+    where = "at the left and right" if rotation else "above and below"
+    assert images.assumed == f"black bars, 14% {where} each, are cut off"
+    sizes = {tuple(sorted(size)) for size in images.sizes.values()}
+    assert sizes <= {(68, 128), (70, 128)}
+    pictures = tmp_path / "p"
+    pictures.mkdir()
+    for i in (0, 4, 8):
+        Image.fromarray(np.pad(frames[i], ((0, 0), (20, 20), (0, 0)))).save(pictures / f"{i}.png")
+    told = take(tmp_path, Source(images=pictures), lambda title: nullcontext(quiet), count=None, size=None)
+    assert told.assumed == "black bars, 12% at the left and right each, stay: crop the pictures"
+    pixels = np.asarray(Image.open(images.folder / next(iter(images.times))))[..., 0]
+    assert pixels.max(1).min() > 150
+    assert pixels.max(0).min() > 150
+
+
+@pytest.mark.parametrize("frame", ["dark above", "uneven", "soft"])
+def test_what_is_no_pair_of_bars_stays(frame):
+    brightest = np.full((96, 128), 200)
+    brightest[:12] = 0
+    if frame != "dark above":
+        brightest[-12 if frame == "soft" else -20 :] = 0
+    if frame == "soft":
+        brightest = gaussian_filter(brightest.astype(float), 8)
+    assert bars_of(brightest) == (0, 0)
 
 
 def test_by_default_every_frame_of_a_short_film_is_taken(tmp_path):

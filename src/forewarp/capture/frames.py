@@ -39,6 +39,8 @@ _SAME = 0.3  # mean difference of two images, of 255, below which one repeats th
 _MEASURED = 640  # pixels of the longer side at which sharpness is measured
 _COARSE = 160  # pixels of the longer side at which blur is told from what a codec adds
 _FLAT = 1e-9  # mean square of a second difference below which an image has no edges
+_BLACK, _LIT = 24, 60  # of 255: in a bar at most, black of limited range and noise; beside it at least
+_EVEN, _LEAST_BAR = 2, 0.02  # pixels of 640 by which bars at both sides may differ; least share of the side
 _WHOLE = 0.9  # share of its duration after which a video counts as whole
 _STAMP = re.compile(r"Parsed_showinfo.* n: *\d+ .* pts_time:(\S+)")
 _DURATION = re.compile(r"Duration: (\d+):(\d+):([\d.]+)")
@@ -132,7 +134,7 @@ def take(
         for left in (folder, dark):
             shutil.rmtree(left, ignore_errors=True)
         if source.video is not None:
-            done = _from_video(folder, source.video, count, size, step, threads)
+            done = _from_video(folder, source, count, size, step, threads)
             done["why"] = done["why"] or why
         else:
             done = _from_folder(folder, source, size, step)
@@ -144,11 +146,12 @@ def take(
 
 
 def _from_video(
-    folder: Path, video: Path, count: int | None, size: int | None, step: Step, threads: int | None
+    folder: Path, source: Source, count: int | None, size: int | None, step: Step, threads: int | None
 ) -> dict:
-    """Write the sharpest frames, named after their numbers in the video, from 1."""
+    """Write the sharpest frames without black bars, named after their numbers in the video, from 1."""
+    video = source.video
     with step("looking at frames") as progress:
-        stamps, sharpnesses, widths, speeds, are_new = measure(video, progress, threads)
+        stamps, sharpnesses, widths, speeds, are_new, brightest = measure(video, progress, threads)
     if len(stamps) < _MIN_IMAGES:
         got = f"{len(stamps)} frames"
         raise ValueError(f"{video}: expected a video of many frames, but got {got}; film longer")
@@ -157,10 +160,14 @@ def _from_video(
     if why and len(kept) < len(stamps):
         why += f"; {len(stamps) - len(kept)} repeat the one before"
     chosen, times = kept[sharpest(stamps[kept], sharpnesses[kept], count)].tolist(), {}
+    bars = bars_of(brightest)
+    assumed = _told(bars, "are cut off")
+    if source.masks is not None:
+        assumed, bars = _told(bars, "stay, as masks= are of whole frames"), (0.0, 0.0)
     transfer = hdr_of(video)
     mapped = f" ({_HDR[transfer]}, tone-mapped to SDR)" if transfer else ""
     with step(f"taking frames{mapped}") as progress:
-        for index, pixels in zip(chosen, extracted(video, chosen, size, threads)):
+        for index, pixels in zip(chosen, extracted(video, chosen, size, threads, bars)):
             name = f"frame_{index + 1:06d}.jpg"
             write_image(folder / name, pixels)
             times[name] = float(stamps[index])
@@ -169,7 +176,43 @@ def _from_video(
         raise ValueError(f"{video}: expected {len(chosen)} frames, but got {len(times)}; convert the video")
     height, width = pixels.shape[:2]
     record = _record(times, chosen, len(stamps), widths[chosen], dict.fromkeys(times, (width, height)), {})
-    return record | {"why": why}
+    return record | {"why": why, "assumed": assumed}
+
+
+def bars_of(brightest: np.ndarray) -> tuple[float, float]:
+    """Measure the black bars that a film was given to fit another shape, as shares of its width and height.
+
+    Bars are black in all frames, end sharply and are as wide at both sides; a dark background is not.
+
+    Args:
+        brightest: (H, W) of 255, the greatest value of each pixel over all frames.
+
+    Returns:
+        the share at the left and at the right each, and that above and below.
+
+    >>> frame = np.zeros((40, 50))
+    >>> frame[5:35] = 200
+    >>> bars_of(frame)
+    (0.0, 0.15)
+    """
+    shares = []
+    for axis in (0, 1):
+        values = brightest.max(axis)
+        lit, share = np.flatnonzero(values > _BLACK), 0.0
+        if len(lit):
+            ends, inner = (lit[0], len(values) - 1 - lit[-1]), values[lit[0] : lit[-1] + 1]
+            sharp = min(inner[:3].max(), inner[-3:].max()) > _LIT
+            if sharp and abs(ends[0] - ends[1]) <= _EVEN and min(ends) >= _LEAST_BAR * len(values):
+                share = float(max(ends) + 1) / len(values)  # what a codec mixes goes, too
+        shares.append(share)
+    return tuple(shares)
+
+
+def _told(bars: tuple[float, float], what: str) -> str | None:
+    """Say where bars are, and what happens to them; None where there are none."""
+    places = zip(bars, ("at the left and right", "above and below"))
+    told = ", ".join(f"{share:.0%} {where}" for share, where in places if share)
+    return f"black bars, {told} each, {what}" if told else None
 
 
 def frames_for(speeds: np.ndarray) -> tuple[int, str]:
@@ -218,7 +261,7 @@ def _from_folder(folder: Path, source: Source, size: int | None, step: Step) -> 
         numbers = dict(zip(paths, times))
         paths.sort(key=numbers.get)
     has_alpha = common_header(paths, one_size=not as_stored).has_alpha
-    widths, originals, sizes, times, first = [], {}, {}, {}, None
+    widths, originals, sizes, times, first, brightest = [], {}, {}, {}, None, 0
     with step("reading pictures") as progress:
         for done, path in enumerate(paths, 1):
             pixels = read_image(path, upright=not as_stored).numpy()
@@ -243,9 +286,12 @@ def _from_folder(folder: Path, source: Source, size: int | None, step: Step) -> 
             originals[name] = path.relative_to(source.images).as_posix()
             sizes[name], times[name] = (pixels.shape[1], pixels.shape[0]), float(numbers[path])
             widths.append(edge_width(pixels[..., :3].mean(-1)))
+            if not as_stored:
+                brightest = np.maximum(brightest, pixels[..., :3].max(-1))
             progress(done, len(paths))
     record = _record(times, range(len(paths)), len(paths), widths, sizes, originals)
-    return record | {"assumed": assumed}
+    bars = (0.0, 0.0) if as_stored else bars_of(brightest)
+    return record | {"assumed": assumed or _told(bars, "stay: crop the pictures")}
 
 
 def _record(times: dict, rows: Sequence[int], found: int, widths, sizes: dict, originals: dict) -> dict:
@@ -427,6 +473,7 @@ def measure(video: Path, progress: Progress, threads: int | None = None) -> tupl
     Returns:
         (N,) each: seconds from the first frame, ascending; ``sharpness``; ``edge_width``; ``speed``, 0 of the
         first; and whether a frame does not repeat the one before, as films of another rate are converted.
+        Then (h, w), the greatest value of each pixel.
 
     Raises:
         ValueError: where the file is no video, ends too early, or has a single frame.
@@ -434,6 +481,7 @@ def measure(video: Path, progress: Progress, threads: int | None = None) -> tupl
     **Cost** one decoding, and about 13 ms a frame.
     """
     sharp, widths, speeds, are_new, before, log = [], [], [], [], None, _Log()
+    brightest = 0
     long, short = (f"if(gt({a},{b}),{_MEASURED},-1)" for a, b in (("iw", "ih"), ("ih", "iw")))
     small = f"scale=w='min(iw,{long})':h='min(ih,{short})',format=gray"
     for image in _decode(video, f"showinfo=checksum=0,{small}", "pgm", log, threads):
@@ -441,18 +489,23 @@ def measure(video: Path, progress: Progress, threads: int | None = None) -> tupl
         widths.append(edge_width(image))
         speeds.append(0.0 if before is None else speed(before, image))
         are_new.append(before is None or np.abs(image - before.astype(np.float32)).mean() >= _SAME)
-        before = image
+        before, brightest = image, np.maximum(brightest, image)
         if len(sharp) % 10 == 1 and log.duration and log.stamps:
             seconds = min(log.stamps[-1] - log.stamps[0], log.duration)
             progress(round(10 * seconds), math.ceil(10 * log.duration))
     _refuse(video, log, len(sharp))
     progress(len(sharp), len(sharp))
     stamps = np.array(log.stamps[: len(sharp)])
-    return stamps - stamps[0], np.array(sharp), np.array(widths), np.array(speeds), np.array(are_new)
+    stamps -= stamps[0]
+    return stamps, *map(np.array, (sharp, widths, speeds, are_new)), brightest
 
 
 def extracted(
-    video: Path, chosen: Sequence[int], size: int | None, threads: int | None = None
+    video: Path,
+    chosen: Sequence[int],
+    size: int | None,
+    threads: int | None = None,
+    bars: tuple[float, float] = (0.0, 0.0),
 ) -> Iterator[np.ndarray]:
     """Yield the frames ``chosen``, ascending indices: uint8 (H, W, 3), square pixels, upright.
 
@@ -461,6 +514,7 @@ def extracted(
         chosen: from 0.
         size: most pixels of the longer side; None: as filmed.
         threads: None: as many as ffmpeg likes.
+        bars: to cut off, see ``bars_of``.
     """
 
     def any_of(indices: Sequence[int]) -> str:
@@ -471,6 +525,8 @@ def extracted(
         return f"({any_of(indices[:half])}+{any_of(indices[half:])})"
 
     filters = f"select='{any_of(chosen)}',scale=w='iw*sar':h=ih"
+    if max(bars) > 0:
+        filters += f",crop=w=iw*{1 - 2 * bars[0]}:h=ih*{1 - 2 * bars[1]}"
     if size is not None:
         fit = f"w='if(gt(iw,ih),min(iw,{size}),-1)':h='if(gt(iw,ih),-1,min(ih,{size}))'"
         filters += f",scale={fit}:flags=area"
