@@ -9,6 +9,7 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from forewarp.data import dnerf, hypernerf, nhr, posed_video
 from forewarp.data.dnerf import Shot
@@ -390,6 +391,35 @@ def test_a_dome_has_no_lenses(tmp_path):
 def test_the_writers_refuse_what_could_not_be_read(tmp_path, write, what, match):
     with pytest.raises(ValueError, match=match):
         write(tmp_path / "toy", what)
+
+
+@pytest.mark.parametrize("name", ["dnerf", "rig", "dome", "video"])
+def test_images_that_are_to_be_turned_are_read_as_stored_and_named(scene, name):
+    folder, exif = scene(name), Image.Exif()
+    exif[0x0112] = 6
+    for file in [file for file in folder.rglob("*.png") if file.stem != "m"]:
+        with Image.open(file) as image:
+            image.convert("RGB").save(file.with_suffix(".jpg"))
+        file.unlink()
+        for listed in folder.glob("*.json"):
+            listed.write_text(listed.read_text().replace(f"{file.stem}.png", f"{file.stem}.jpg"))
+    before = READ[name](folder.parent, name)
+    file = before.train[0].load.path
+    with Image.open(file) as image:
+        image.save(file, exif=exif)
+    after = READ[name](folder.parent, name)
+    assert after.train[0].camera.width == before.train[0].camera.width
+    (line,) = [line for line in after.protocol["assumed"] if "EXIF" in line]
+    assert f"1 images are read as stored, although their EXIF orientation turns them ({file.name}" in line
+
+
+@pytest.mark.parametrize("name", ["rig", "video", "dome"])
+def test_images_turned_by_a_quarter_are_named(scene, name):
+    folder = scene(name)
+    with Image.open(file := READ[name](folder.parent, name).train[1].load.path) as image:
+        image.rotate(90, expand=True).save(file)
+    with pytest.raises(SceneError, match=rf"{file.name}: .*width and height are exchanged: turn its pixels"):
+        READ[name](folder.parent, name)
 
 
 TWO_VIEWS, SPLITS = dome(2), ["train"] * 5 + ["test"] * 5

@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from PIL import Image
 
 from forewarp.data.files import SceneError
 from forewarp.data.images import write_image
@@ -148,19 +147,6 @@ def test_a_ply_that_cannot_be_read_is_refused(tmp_path, text, says):
     (tmp_path / "toy" / "sparse_pc.ply").write_text(text)
     with pytest.raises(SceneError, match=says):
         read_scene(tmp_path, "toy")
-
-
-def test_images_that_are_to_be_turned_are_read_as_stored_and_named(tmp_path):
-    write_scene(tmp_path / "toy", [replace(s, name=s.name.replace(".png", ".jpg")) for s in posed_shots()])
-    before, (file, *_) = read_scene(tmp_path, "toy"), sorted((tmp_path / "toy" / "images").glob("*.jpg"))
-    exif = Image.Exif()
-    exif[0x0112] = 6
-    with Image.open(file) as image:
-        image.save(file, exif=exif)
-    scene = read_scene(tmp_path, "toy")
-    assert scene.train[0].camera.width == before.train[0].camera.width
-    (line,) = [line for line in scene.protocol["assumed"] if "EXIF" in line]
-    assert f"1 images are read as stored, although their EXIF orientation turns them ({file.name}" in line
 
 
 def test_each_frame_may_have_its_own_camera(made):

@@ -47,7 +47,15 @@ from forewarp.data.files import (
     scene_folder,
     whole,
 )
-from forewarp.data.images import StoredImage, alpha_of, by, check_pixels, inspect_image, write_image
+from forewarp.data.images import (
+    StoredImage,
+    alpha_of,
+    by,
+    check_pixels,
+    inspect_image,
+    turned_by_exif,
+    write_image,
+)
 from forewarp.data.transforms import (
     camera_of,
     check_axes,
@@ -300,7 +308,7 @@ def _read_file(
     path: Path, ability: str, axes: str | None, inverse: bool, longer: bool
 ) -> tuple[list[_Record], list[str]]:
     """Read a transforms file; without its images where it is of a test split that was never rendered."""
-    content, records = read_json(path), []
+    content, records, turned = read_json(path), [], []
     entries = frames_of(path, content, content | {"ability": ability})
     images = [with_suffix(entry.path("file_path")) for entry in entries]
     if ability != "all" or path.stem == "transforms_train" or any(os.path.isfile(i) for i in images):
@@ -320,6 +328,7 @@ def _read_file(
         if ability not in (*ABILITIES, "all"):
             raise mismatch(entry.where("ability"), f"one of {', '.join(ABILITIES)}", short(ability))
         header, mask = inspect_image(image), None
+        turned += [image] if header.is_turned else []
         if "mask_path" in entry.own:
             mask = with_suffix(entry.path("mask_path"))
             inspect_image(mask, header.size, f" as {image.name}")
@@ -329,6 +338,7 @@ def _read_file(
         by_angle = entry.get("camera_angle_x") is not None
         by_angle &= entry.get("fl_x") is None and entry.get("fl_y") is None
         records.append(_Record(time_in(entry), camera, image, has_alpha, mask, depth, ability, by_angle))
+    assumed += turned_by_exif(turned, path)
     return records, assumed + left_aside(zip((entry for entry, _ in there), (r.camera for r in records)))
 
 

@@ -34,7 +34,7 @@ from forewarp.data.cameras import (
 )
 from forewarp.data.directions import opposite, other_readings
 from forewarp.data.files import Entry, inside, mismatch, number, read_json, remove, scene_folder, whole
-from forewarp.data.images import StoredImage, check_pixels, inspect_image, write_image
+from forewarp.data.images import StoredImage, check_pixels, inspect_image, turned_by_exif, write_image
 from forewarp.data.transforms import check_pinhole, with_images, with_suffix
 from forewarp.files import write_json
 from forewarp.scene.camera import Camera, Lens
@@ -118,6 +118,7 @@ def read_scene(root: str | Path, scene: str, *, scale: int = 2, box: Sequence[fl
             raise mismatch(folder / "dataset.json", f"an image of {part} that is there", "none")
 
     stored: dict[str, Tensor] = {}  # poses in the unscaled world
+    turned: list[Path] = []
 
     def frame(item: str) -> Frame:
         path = paths[item]
@@ -125,7 +126,8 @@ def read_scene(root: str | Path, scene: str, *, scale: int = 2, box: Sequence[fl
         stored[item] = camera.camera_to_world
         camera = reduced(normalised.camera(camera), scale)
         size = camera.width, camera.height
-        inspect_image(path, size, f", the camera's image_size / {scale}")
+        if inspect_image(path, size, f", the camera's image_size / {scale}").is_turned:
+            turned.append(path)
         load = StoredImage(path, size, opaque=True)  # of dycheck's an alpha of 0 says "no depth here"
         return Frame(item, times[item], camera, load, camera_id=camera_ids[item])
 
@@ -139,6 +141,7 @@ def read_scene(root: str | Path, scene: str, *, scale: int = 2, box: Sequence[fl
         "train_frames": len(train),
         "test_frames": len(test),
     }
+    assumed += turned_by_exif(turned, images)
     if ways := other_readings(list(stored.values()), _READINGS):
         line = "cameras do not look at one thing, as all of them do if"
         assumed.append(f"{folder / 'camera'}: {line} {', or if '.join(ways)}; if so, write them anew")

@@ -25,6 +25,7 @@ from forewarp.ops.grid import block_means, block_sums
 from forewarp.scene.frame import spread
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")
+TURN = "width and height are exchanged: turn its pixels by 90 degrees"
 _FORMATS = ("PNG", "JPEG")
 _MOST_PIXELS = 80_000_000  # Pillow warns a little above
 _OTHER_KINDS = {  # at which byte, which marks tell them
@@ -126,8 +127,23 @@ def inspect_image(path: Path, size: tuple[int, int] | None = None, why: str = ""
     with opened(path, MOST_IMAGE, "an image") as stream:
         header = _inspect(stream, path)
     if size not in (None, header.size):
-        raise mismatch(path, f"{by(size)} pixels{why}", by(header.size))
+        advice = TURN if header.size == tuple(size)[::-1] else ""
+        raise mismatch(path, f"{by(size)} pixels{why}", by(header.size), advice)
     return header
+
+
+def turned_by_exif(paths: Sequence[Path], where: object) -> list[str]:
+    """Say in a line that images were read as stored, although their EXIF orientation turns them.
+
+    Args:
+        paths: those whose header says ``is_turned``.
+        where: what they belong to.
+    """
+    if not paths:
+        return []
+    line = f"{len(paths)} images are read as stored, although their EXIF orientation turns them"
+    advice = "if poses are of the images upright, turn the pixels"
+    return [f"{where}: {line} ({paths[0].name}, ..); {advice}"]
 
 
 def common_header(paths: Iterable[Path], one_size: bool = True) -> Header:

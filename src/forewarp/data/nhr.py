@@ -21,7 +21,7 @@ from forewarp.data.arrays import read_cloud, read_truth, shortened, write_array,
 from forewarp.data.cameras import box_of, check_middle, pose_of
 from forewarp.data.directions import inverted, opposite, other_readings
 from forewarp.data.files import SceneError, mismatch, numbers_of, opened, remove, scene_folder, whole
-from forewarp.data.images import StoredImage, by, check_pixels, inspect_image, write_image
+from forewarp.data.images import StoredImage, by, check_pixels, inspect_image, turned_by_exif, write_image
 from forewarp.files import decoded, replace_file
 from forewarp.scene.box import Box
 from forewarp.scene.camera import Camera
@@ -93,7 +93,7 @@ def read_scene(
     counted = (path.stem[4:] for place in places for path in place.glob("img_*.jpg"))
     first = min((int(number) for number in counted if number.isdecimal()), default=0)
     names = [f"img_{k:04d}.jpg" for k in range(first, first + len(poses))]
-    sizes = _read_sizes(places[:moments], names, half_resolution)
+    sizes, turned = _read_sizes(places[:moments], names, half_resolution)
     bounds, assumed = _bounds(folder, numbers, len(places)) if box is None else (box_of(box), [])
     cameras = [_camera(*of, half_resolution, bounds) for of in zip(sizes, matrices, poses, strict=True)]
     for number, camera in enumerate(cameras):
@@ -120,8 +120,9 @@ def read_scene(
     }
     if on_disk[0] != 0 or first != 0 or on_disk[-1] - on_disk[0] >= len(on_disk):
         said = f"frames {on_disk[0]} to {on_disk[-1]} ({len(on_disk)}) and cameras from {first}"
-        line = f"{folder / 'img'}: {said} taken in order, times by their numbers"
-        protocol["assumed"] = [line, *assumed]
+        assumed = [f"{folder / 'img'}: {said} taken in order, times by their numbers", *assumed]
+    if assumed := [*assumed, *turned_by_exif(turned, folder / "img")]:
+        protocol["assumed"] = assumed
     truth = read_truth(folder / "trajectories.npz", 0.0)
     if truth is not None and moments < len(places):  # the file's times are those of all frames on disk
         truth = shortened(truth, (numbers[-1] - numbers[0]) / (on_disk[-1] - on_disk[0]))
@@ -237,9 +238,14 @@ def _held_out(views: Sequence[int] | None, count: int, folder: Path) -> list[int
     return sorted(views)
 
 
-def _read_sizes(folders: Sequence[Path], names: Sequence[str], halve: bool) -> list[tuple[int, int]]:
-    """Read the size (width, height) of every camera's images and check that all have it."""
+def _read_sizes(
+    folders: Sequence[Path], names: Sequence[str], halve: bool
+) -> tuple[list[tuple[int, int]], list[Path]]:
+    """Read the size (width, height) of every camera's images and check that all have it; also list those that
+    their EXIF orientation turns.
+    """
     sizes: list[tuple[int, int] | None] = [None] * len(names)
+    turned: list[Path] = []
     for folder in folders:
         for place in (folder, folder / "mask"):
             if extra := sorted({path.name for path in place.glob("img_*")}.difference(names)):
@@ -247,10 +253,12 @@ def _read_sizes(folders: Sequence[Path], names: Sequence[str], halve: bool) -> l
                 raise mismatch(place / extra[0], expected, "another")
             for k, name in enumerate(names):
                 why = f" as in img/{folders[0].name}/{name}"
-                sizes[k] = inspect_image(place / name, sizes[k], why).size
+                header = inspect_image(place / name, sizes[k], why)
+                sizes[k] = header.size
+                turned += [place / name] if header.is_turned else []
                 if halve and min(sizes[k]) < 2:
                     raise mismatch(place / name, "at least 2 x 2 pixels to halve", by(sizes[k]))
-    return sizes
+    return sizes, turned
 
 
 def _bounds(folder: Path, numbers: Sequence[int], count: int) -> tuple[Box, list[str]]:

@@ -45,6 +45,7 @@ from forewarp.data.images import (
     check_pixels,
     hides_image,
     inspect_image,
+    turned_by_exif,
     write_image,
 )
 from forewarp.data.transforms import (
@@ -297,11 +298,7 @@ def _read_entries(
         if any(given) and not all(given):
             got = f"{sum(given)} of {len(given)} and none in frames[{given.index(False)}]"
             raise mismatch(f"{file}: frames: {key}", "one in all frames or in none", got)
-    if turned:
-        assumed.append(
-            f"{file}: {len(turned)} images are read as stored, although their EXIF orientation turns them "
-            f"({turned[0].name}, ..); if poses are of the images upright, turn the pixels"
-        )
+    assumed += turned_by_exif(turned, file)
     names = [entry.name for entry in entries]
     if len(set(names)) < len(names):
         twice = next(name for i, name in enumerate(names) if name in names[:i])

@@ -21,7 +21,7 @@ import torch
 
 from forewarp.data.cameras import FLIP, check_lens, check_middle, pose_of
 from forewarp.data.files import Entry, mismatch, nearly
-from forewarp.data.images import SUFFIXES, by, in_order
+from forewarp.data.images import SUFFIXES, TURN, by, in_order
 from forewarp.scene.camera import Camera, Lens
 
 Thing = TypeVar("Thing")
@@ -86,7 +86,8 @@ def camera_of(
     sizes = [entry.number(key, 1, 1e6, n * scale) for key, n in zip("wh", stored)]
     if any(abs(n - size / scale) >= 1 for n, size in zip(stored, sizes)):
         expected = " x ".join(f"{size / scale:g}" for size in sizes)
-        raise mismatch(image, f"{expected} pixels as {entry.where('w')} and h say", by(stored))
+        advice = TURN if all(abs(n - size / scale) < 1 for n, size in zip(stored, sizes[::-1])) else ""
+        raise mismatch(image, f"{expected} pixels as {entry.where('w')} and h say", by(stored), advice)
     width, height = map(round, sizes)
     fx = _focal(entry, width, height, longer)
     fy = entry.number("fl_y", 0.01 * height, 100 * height, fx)
