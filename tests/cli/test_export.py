@@ -39,6 +39,7 @@ def test_it_writes_what_the_run_has_into_its_folder_and_says_so(forewarp, ok, fi
     ("words", "says"),
     [
         (["format=stl"], "format: expected one of ply, glb, mesh, gltf, html, npz, but got 'stl'"),
+        (["layer=still"], "layer: expected all or moving or resting, but got still"),
         (["times=0"], "times: expected a whole number of at least 1, or a list, but got 0"),
         (["times=[0,2]"], "times: expected numbers in [0, 1], but got [0, 2]"),
         (["times=[1,0]"], "times: expected each later than the one before, but got [1, 0]"),
@@ -57,6 +58,14 @@ def test_mistakes_end_before_anything_is_loaded(monkeypatch, words, says):
     config = OmegaConf.merge(OmegaConf.load(CONF / "export.yaml"), OmegaConf.from_dotlist(words))
     with pytest.raises(ValueError, match=re.escape(says)):
         check(config)
+
+
+def test_a_method_without_particles_has_no_layers(refused, fitted):
+    says = "expected a run of particles, as they alone tell what moves, but got one of another method"
+    assert refused("export", f"run={fitted}", "layer=moving", "times=2") == f"layer: {says}; leave it out"
+    assert refused("render", f"run={fitted}", "layer=resting", "frames=2") == f"layer: {says}; leave it out"
+    assert refused("render", f"run={fitted}", "masks=true", "frames=2") == f"masks: {says}; leave it out"
+    assert not (fitted / "exports").exists()
 
 
 def test_a_folder_of_others_is_left_alone(refused, fitted, in_tmp):

@@ -53,6 +53,8 @@ def test_a_gif_of_small_images_is_larger_and_large_images_keep_their_size(ok, ru
         ("fps=0", "fps: expected a number in [0.1, 1000], but got 0"),
         ("format=avi", "format: expected one of mp4, gif, png, but got 'avi'"),
         ("size=3", "size: expected a whole number of at least 16, but got 3"),
+        ("layer=still", "layer: expected one of all, moving, resting, but got 'still'"),
+        ("masks=folder", "masks: expected true or false, but got folder"),
         ("view=99", "view: expected a test view, 0 to 4, but got 99"),
     ],
 )

@@ -29,7 +29,7 @@ class FakeViewer:
         self.watch, self.cost, self.scene = watch or Watch(), cost, ball_scene(frames=4)
         self.queue, self.interrupt = RenderQueue(self.watch), None
         method = SimpleNamespace(ellipsoids=lambda time: f"splats at {time}")
-        self.renderers = [SimpleNamespace(module=SimpleNamespace(method=method))]
+        self.renderers = [SimpleNamespace(method_of=lambda layer: method)]
 
     def supported(self, state):
         return state

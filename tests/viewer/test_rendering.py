@@ -8,6 +8,7 @@ from forewarp.scene.camera import look_at
 from forewarp.scene.view import Moment, View
 from forewarp.viewer.queue import Cancelled
 from forewarp.viewer.rendering import SceneRenderer, Viewer, ViewState, camera_of, turning_axis
+from tests.support.particles import EVERY, module_with, shaken, small_data
 from tests.support.tiny_scene import BOX, ball_center, ball_data, ball_scene, camera_at, known_ball
 
 SIZE = 60
@@ -110,6 +111,27 @@ def test_a_time_is_warped_to_once_and_what_has_changed_is_forgotten(viewer, stat
     renderer.invalidate()
     image_of(viewer, replace(state, time=0.3))
     assert asked == [0.3, 0.6, 0.3]
+
+
+def test_a_layer_shows_its_particles_alone_and_voxels_have_none(viewer, state):
+    data = small_data()
+    module = shaken(module_with(data, **EVERY))
+    rows = torch.arange(len(module.method.means)) % 2 == 0
+    module.method.__class__ = type("Told", (type(module.method),), {"in_motion": lambda self, frames: rows})
+    seen, first = Viewer(data.scene, [SceneRenderer("particles", module, data)]), ViewState.first(data.scene)
+    assert (seen.layers, viewer.layers) == (("all", "moving", "resting"), ("all",))
+    assert viewer.supported(replace(state, layer="moving")).layer == "all"
+    camera, images = camera_of(first, 24, 24, data.scene), []
+    for layer, part in (("moving", rows), ("resting", ~rows)):
+        shown = seen.supported(replace(first, layer=layer, channel="opacity"))
+        images.append(image_of(seen, shown, 24, 24))
+        with torch.no_grad():
+            alone = module.method.only(part).at(Moment(first.time)).render(View(camera), torch.ones(3))
+        torch.testing.assert_close(images[-1][..., 0].flatten(), alone.opacity.clamp(0, 1))
+    assert float((images[0] - images[1]).abs().max()) > 0.1
+    seen.renderers[0].invalidate()  # as the method has changed
+    rows.fill_(False)
+    assert float(image_of(seen, replace(first, layer="moving", channel="opacity"), 24, 24).max()) == 0
 
 
 def test_a_stale_image_ends_between_two_chunks(viewer, state):

@@ -253,6 +253,7 @@ def test_controls_offer_what_the_method_of_a_stage_can_show(modules, client, tmp
     renderers = [SceneRenderer("run", module, data) for module in modules]
     viewer.renderers = renderers[:1]
     page.adapt()
+    assert not page.layer.visible  # voxels have none
     page.channel.value, page.trajectories.value = "splats", True
     assert all(part.visible for part in parts)
     assert page._cameras == []  # nothing is made before it is asked for

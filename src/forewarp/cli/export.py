@@ -13,6 +13,7 @@ What one types most:
   format=html                   one page for a browser, without a server, with a time slider
   format=npz                    trajectories of points with what is visible of them, and the method's arrays
   times=N times=[0,0.5]         how many, evenly spaced, or which; not of glb, which holds all
+  layer=moving|resting          only the particles that move, or those that rest
   out=FOLDER                    another folder
   degree=0|1|2|3                ply: how finely colours depend on direction
   up=world|y|-y|z               ply, mesh: which axis points upwards; -y for SuperSplat
@@ -46,6 +47,7 @@ def export(config) -> None:
     folder = Path(config.out or Path(config.run) / "exports" / config.format)
     check_replaceable(folder, ABOUT)
     # These load torch; mistakes have been answered before.
+    from forewarp.evaluation.layers import layer_of
     from forewarp.export.tracks import Source
     from forewarp.progress import Counted
     from forewarp.runs.fitted import method_name, opened
@@ -53,9 +55,10 @@ def export(config) -> None:
     run, module = opened(saved)
     scene = run.datamodule.scene
     cameras = [frame.camera for frame in scene.train]
+    module.method = layer_of(module.method, config.layer, scene.train)
     background = tuple(run.datamodule.targets("train").background.tolist())
     source = Source(module, method_name(saved), cameras, times, background)
-    about = {"run": str(config.run), "scene": scene.name, "method": source.model}
+    about = {"run": str(config.run), "scene": scene.name, "method": source.model, "layer": config.layer}
     options = {name: config[name] for name in FORMATS[config.format].options}
     with Counted(config.format) as progress:
         written = write(config.format, source, folder, about, progress, **options)
@@ -97,7 +100,7 @@ def check(config) -> list[float]:
                 f"{key}: expected an option of format={config.format} ({', '.join(options)}); leave it out"
             )
     require(config.format)
-    for key in options:
+    for key in ("layer", *options):
         check_option(key, config[key])
     times = config.times
     if isinstance(times, ListConfig):

@@ -15,6 +15,8 @@ What one types most:
   frames=N fps=N size=N         how many, how fast, pixels of the longer side (as the images, at least 400)
   view=N                        the test view that it shows or starts from
   format=mp4|gif|png            a video, an animated picture, one picture a frame
+  layer=moving|resting          only the particles that move, or those that rest
+  masks=true                    also a mask of what moves for each picture, in videos/<name>_masks/
   points=N tail=SHARE           how many trajectories, and for what share of the time they stay visible
   trust=[PACKAGE]               code of other packages that the run's config may name
   data.root=FOLDER              where the data are now, if they moved
@@ -27,6 +29,7 @@ from pathlib import Path
 
 from forewarp.cli.entry import command
 
+HALF = 0.5  # share of a pixel, above which it counts as what fills it
 LEAST_SIZE = 400  # pixels of the longer side, unless size= asks for another
 
 
@@ -48,32 +51,50 @@ def render(config) -> None:
 
 
 def write_film(config, run, module) -> Path:
-    """Write the video that the config describes into the run's folder; return its file."""
+    """Write the video that the config describes, and its masks, into the run's folder; return its file."""
     from forewarp.drawing.images import write_video
     from forewarp.progress import Counted
 
-    pictures = pictures_of(config, module, run.datamodule)
-    file = Path(run.folder) / "videos" / f"{config.path}.{config.format}"
+    name = config.path if config.layer == "all" else f"{config.path}_{config.layer}"
+    folder = Path(run.folder) / "videos"
+    pictures = pictures_of(config, module, run.datamodule, folder / f"{name}_masks")
     with Counted(config.path) as progress:
-        return write_video(file, counted(pictures, config.frames, progress), fps=float(config.fps))
+        pictures = counted(pictures, config.frames, progress)
+        return write_video(folder / f"{name}.{config.format}", pictures, fps=float(config.fps))
 
 
-def pictures_of(config, module, datamodule):
-    """Render the pictures of the video that the config describes."""
+def pictures_of(config, module, datamodule, masks: Path):
+    """Render the pictures of the video that the config describes; write their masks, if it asks for any."""
     from forewarp.evaluation.images import make_shots, sized, video
+    from forewarp.evaluation.layers import layer_of, moving_rows
     from forewarp.evaluation.trajectories import Trajectories
 
-    cameras = [frame.camera for frame in datamodule.scene.train]
+    frames = datamodule.scene.train
+    cameras = [frame.camera for frame in frames]
     targets = datamodule.targets("test")
     if config.view >= len(targets):
         raise ValueError(f"view: expected a test view, 0 to {len(targets) - 1}, but got {config.view}")
-    target, paint = targets[config.view], None
+    method, target, paint = module.method, targets[config.view], None
+    moving = moving_rows(method, frames, "masks") if str(config.masks).lower() == "true" else None
+    module.method = layer_of(method, config.layer, frames)
     if config.path == "trajectories":
         paint = Trajectories(module, cameras, count=config.points, tail=float(config.tail))
     camera = target.frame.camera
     start = sized(camera, config.size or max(camera.width, camera.height, LEAST_SIZE))
     shots = make_shots(config.path, config.frames, float(config.time), start, cameras)
-    return video(module, shots, target.background.to(module.device), paint)
+    pictures = video(module, shots, target.background.to(module.device), paint)
+    return pictures if moving is None else with_masks(pictures, method, shots, moving, masks)
+
+
+def with_masks(pictures, method, shots, moving, folder: Path):
+    """Yield pictures; write for each which of its pixels are mostly what moves, ``folder/0000.png`` ..."""
+    from forewarp.drawing.images import write_png
+    from forewarp.evaluation.images import moving_share
+
+    for number, (picture, (camera, time)) in enumerate(zip(pictures, shots)):
+        share = moving_share(method, moving, camera, time)
+        write_png(folder / f"{number:04d}.png", (share > HALF).float())
+        yield picture
 
 
 def counted(pictures, total: int, progress):
@@ -88,10 +109,14 @@ def check(config) -> None:
     from forewarp.cli.prepare import LEAST, RANGES, refuse_numbers
     from forewarp.drawing.images import FORMATS
     from forewarp.evaluation.images import PATHS
+    from forewarp.evaluation.layers import LAYERS
 
-    for key, known in (("path", PATHS), ("format", FORMATS)):
+    for key, known in (("path", PATHS), ("format", FORMATS), ("layer", LAYERS)):
         if config[key] not in known:
             raise ValueError(f"{key}: expected one of {', '.join(known)}, but got '{config[key]}'")
+    config.masks = str(config.masks).lower()  # typed, it is text, as the folder of forewarp-capture is
+    if config.masks not in ("true", "false"):
+        raise ValueError(f"masks: expected true or false, but got {config.masks}")
     refuse_numbers(config, *LEAST, *RANGES)
 
 

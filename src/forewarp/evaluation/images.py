@@ -19,7 +19,7 @@ from forewarp.drawing.images import (
     with_wheel,
     write_png,
 )
-from forewarp.methods.method import HasTrajectories, Snapshot
+from forewarp.methods.method import HasTrajectories, Method, Snapshot
 from forewarp.scene.camera import Camera, focus_point, mean_up, orbit, swing
 from forewarp.scene.view import Moment, Rendering, Target, View
 from forewarp.training.module import DynamicSceneModule
@@ -167,6 +167,13 @@ def video(
             image = drawn.rgb.reshape(camera.height, camera.width, 3).clamp(0, 1)
             image = image if paint is None else paint(image, drawn, camera, time)
         yield image
+
+
+@torch.no_grad()
+def moving_share(method: Method, moving: Tensor, camera: Camera, time: float) -> Tensor:
+    """Render which share (H, W) in [0, 1] of each pixel is what moves, the particles ``moving`` (N,) bool."""
+    share = method.at(Moment(time)).share(View(camera), moving)
+    return share.reshape(camera.height, camera.width)
 
 
 class TensorBoardImages(lightning.Callback):

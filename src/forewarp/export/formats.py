@@ -8,6 +8,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
+from forewarp.evaluation.layers import LAYERS
 from forewarp.files import folder_written_whole, write_json
 
 if TYPE_CHECKING:
@@ -39,6 +40,7 @@ FORMATS = {
 }
 # The values that an option may have: words, or numbers from a least to a most.
 CHOICES = {
+    "layer": LAYERS,
     "quality": ("compact", "lossless"),
     "files": ("ply", "obj"),
     "up": ("world", "y", "-y", "z"),

@@ -14,7 +14,7 @@ from forewarp.fields.moving import MovingGaussians
 from forewarp.ops.backend import is_number
 from forewarp.scene.box import Box, Lattice
 from forewarp.scene.cloud import Cloud, Ellipsoids, Handover
-from forewarp.scene.frame import Scene
+from forewarp.scene.frame import Frame, Scene
 from forewarp.scene.view import Asks, Batch, Moment, Rendering, View
 
 
@@ -317,6 +317,25 @@ class HasMovingGaussians(Protocol):
 
     def moving(self) -> MovingGaussians:
         """Return all of them, without gradients."""
+
+
+@runtime_checkable
+class HasLayers(Protocol):
+    """Tell what moves from what rests, row by row of ``HasEllipsoids``."""
+
+    def in_motion(self, frames: Sequence[Frame]) -> Tensor:
+        """Return which rows (N,) bool move so that images like ``frames`` show it: about a pixel and more."""
+
+    def only(self, rows: Tensor) -> Method:
+        """Return a copy that has only some rows (N',) int64, or those of a mask (N,)."""
+
+
+@runtime_checkable
+class HasShares(Protocol):
+    """Of a snapshot of ``HasLayers``: tell how much of a view some rows are."""
+
+    def share(self, view: View, rows: Tensor) -> Tensor:
+        """Return the share (R,) in [0, 1] of each pixel that is rows (N,) bool, as nothing hides it."""
 
 
 @runtime_checkable

@@ -12,6 +12,37 @@ from forewarp.methods.method import part_of
 from forewarp.ops.adam import AdamState, adam_rows
 
 
+def keep_rows(method: nn.Module, rows: Tensor) -> tuple[list[Parameter], list[Parameter]]:
+    """Replace every parameter and buffer in ``method.grows`` by its ``rows`` (N',) int64, each in [0, N).
+
+    Returns:
+        the parameters before and after, pairwise.
+
+    Raises:
+        ValueError: for rows out of range.
+
+    Cost: one copy of each.
+    """
+    before, after = [], []
+    count = len(part_of(method, method.grows[0]))
+    if rows.dtype != torch.int64 or (len(rows) and not 0 <= int(rows.min()) <= int(rows.max()) < count):
+        raise ValueError(
+            f"rows: expected int64 in [0, {count}), but got {rows.dtype}: {rows[:5].tolist()} ..."
+        )
+    for name in method.grows:
+        place, _, last = name.rpartition(".")
+        owner, value = method.get_submodule(place), part_of(method, name)
+        taken = value.data[rows.to(value.device)]
+        if isinstance(value, Parameter):
+            # A new Parameter: autograd remembers an old one's shape for as long as any graph lives.
+            before.append(value)
+            after.append(Parameter(taken, requires_grad=value.requires_grad))
+            setattr(owner, last, after[-1])
+        else:
+            setattr(owner, last, taken)
+    return before, after
+
+
 @torch.no_grad()
 def take_rows(
     method: nn.Module, optimizer: torch.optim.Optimizer, rows: Tensor, fresh: Tensor | None = None
@@ -31,23 +62,7 @@ def take_rows(
 
     Cost: one copy of each parameter and of its moments.
     """
-    before, after = [], []
-    count = len(part_of(method, method.grows[0]))
-    if rows.dtype != torch.int64 or (len(rows) and not 0 <= int(rows.min()) <= int(rows.max()) < count):
-        raise ValueError(
-            f"rows: expected int64 in [0, {count}), but got {rows.dtype}: {rows[:5].tolist()} ..."
-        )
-    for name in method.grows:
-        place, _, last = name.rpartition(".")
-        owner, value = method.get_submodule(place), part_of(method, name)
-        taken = value.data[rows.to(value.device)]
-        if isinstance(value, Parameter):
-            # A new Parameter: autograd remembers an old one's shape for as long as any graph lives.
-            before.append(value)
-            after.append(Parameter(taken, requires_grad=value.requires_grad))
-            setattr(owner, last, after[-1])
-        else:
-            setattr(owner, last, taken)
+    before, after = keep_rows(method, rows)
     renew_parameters(optimizer, before, after, rows if fresh is None else rows.masked_fill(fresh, -1))
 
 

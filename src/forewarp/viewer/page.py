@@ -15,6 +15,7 @@ from viser.transforms import SO3
 
 from forewarp.browser import splat_arrays, vertical_fov
 from forewarp.drawing.images import hues, png_bytes, to_bytes
+from forewarp.evaluation.layers import LAYERS
 from forewarp.scene.cloud import Ellipsoids
 from forewarp.scene.frame import spread
 from forewarp.viewer.queue import Cancelled
@@ -68,6 +69,7 @@ class Page:
             # viser chooses the first where the chosen one is gone, as ``Viewer.supported`` does
             self.channel.options = channels
         self.about_splats.visible = SPLATS in channels
+        self.layer.visible = len(self.viewer.layers) > 1
         for control in (self.trajectories, self.follow, self.follow_none):
             control.visible = can_follow
         if not can_follow and self.trajectories.value:
@@ -214,6 +216,7 @@ class Page:
             chosen = session.state.channel
             self.channel = gui.add_dropdown("show", self.viewer.channels, initial_value=chosen)
             self.about_splats = gui.add_markdown(_ABOUT_SPLATS)
+            self.layer = gui.add_dropdown("layer", LAYERS, initial_value=session.state.layer)
             self.trajectories = gui.add_checkbox("trajectories", False)
             self.follow = gui.add_button(_FOLLOW)
             self.follow_none = gui.add_button("follow none")
@@ -230,6 +233,7 @@ class Page:
             self.follow.label = "now click a point"
 
         on_edit(self.channel, lambda channel: self._change(channel=channel))
+        on_edit(self.layer, lambda layer: self._change(layer=layer))
         on_edit(self.trajectories, lambda shown: session.change(trajectories=shown))
         on_press(self.follow, wait_for_click)
         on_press(self.follow_none, lambda: session.change(followed=()))

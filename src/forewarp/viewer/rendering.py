@@ -14,8 +14,9 @@ from torch import Tensor
 from forewarp.browser import vertical_fov
 from forewarp.drawing.images import depth_colors, flow_colors, in_a_row, with_wheel
 from forewarp.evaluation.images import compare, image_flow
+from forewarp.evaluation.layers import LAYERS, layer_of
 from forewarp.evaluation.trajectories import Trajectories
-from forewarp.methods.method import HasEllipsoids, HasMatter, HasTrajectories, Snapshot
+from forewarp.methods.method import HasEllipsoids, HasLayers, HasMatter, HasTrajectories, Method, Snapshot
 from forewarp.scene.camera import Camera, focus_point, mean_up
 from forewarp.scene.frame import Scene
 from forewarp.scene.view import Moment, Rendering, View
@@ -44,6 +45,7 @@ class ViewState:
         fov: vertical, radians.
         time: in [0, 1].
         channel: one of ``SceneRenderer.channels``.
+        layer: one of ``SceneRenderer.layers``; a training view is always compared as a whole.
         trajectories: draw trajectories of points all over the moving surface.
         followed: points, each with the time at which it is there, whose trajectories are drawn.
         training_view: the training view that is compared with its image; None: none.
@@ -53,6 +55,7 @@ class ViewState:
     fov: float
     time: float = 0.0
     channel: str = "colour"
+    layer: str = LAYERS[0]
     trajectories: bool = False
     followed: tuple[tuple[Point, float], ...] = ()
     training_view: int | None = None
@@ -112,7 +115,8 @@ class SceneRenderer:
         self.targets = datamodule.targets("train")
         self.background = self.targets.background
         self.renewal, self.tracks = renewal, tracks
-        self._snapshots: list[Snapshot] = []
+        self._layers: dict[str, Method] = {}
+        self._snapshots: list[tuple[str, Snapshot]] = []  # with their layers
         self._trajectories: tuple[float, Trajectories] | None = None
         self._canonical = lru_cache(_POINTS)(self.canonical_point)
         self._followed = lru_cache(_PATHS)(self._follow)
@@ -129,8 +133,23 @@ class SceneRenderer:
         splats = (SPLATS,) if isinstance(self.module.method, HasEllipsoids) else ()
         return ("colour", "depth", "opacity", *motion, *splats)
 
+    @property
+    def layers(self) -> tuple[str, ...]:
+        """Which parts of the scene can be shown alone, beside all of it."""
+        return LAYERS if isinstance(self.module.method, HasLayers) else LAYERS[:1]
+
+    def method_of(self, layer: str) -> Method:
+        """Return the method, or the part of it that is a layer; there may be nothing in that."""
+        if layer == LAYERS[0]:
+            return self.module.method
+        if layer not in self._layers:
+            part = layer_of(self.module.method, layer, self.scene.train, may_be_empty=True)
+            self._layers[layer] = part
+        return self._layers[layer]
+
     def invalidate(self) -> None:
         """Forget what was computed from the method's parameters, which have changed."""
+        self._layers.clear()
         self._snapshots.clear()
         self._canonical.cache_clear()
         self._followed.cache_clear()
@@ -138,12 +157,12 @@ class SceneRenderer:
             self._trajectories[1].forget()
 
     @torch.no_grad()
-    def snapshot_at(self, moment: Moment) -> Snapshot:
+    def snapshot_at(self, moment: Moment, layer: str = LAYERS[0]) -> Snapshot:
         """Return the snapshot of a moment; the last two are kept."""
-        snapshot = next((kept for kept in self._snapshots if kept.holds(moment)), None)
-        snapshot = snapshot or self.module.method.at(moment)
-        others = [kept for kept in self._snapshots if kept is not snapshot]
-        self._snapshots = [snapshot, *others][:_SNAPSHOTS]
+        snapshot = next((kept for of, kept in self._snapshots if of == layer and kept.holds(moment)), None)
+        snapshot = snapshot or self.method_of(layer).at(moment)
+        others = [pair for pair in self._snapshots if pair[1] is not snapshot]
+        self._snapshots = [(layer, snapshot), *others][:_SNAPSHOTS]
         return snapshot
 
     @property
@@ -155,9 +174,9 @@ class SceneRenderer:
         if state.training_view is not None:
             self.snapshot_at(self.targets[state.training_view].moment)
             return
-        self.snapshot_at(Moment(state.time))
+        self.snapshot_at(Moment(state.time), state.layer)
         if state.channel == "motion":
-            self.snapshot_at(self._canonical_moment)
+            self.snapshot_at(self._canonical_moment, state.layer)
 
     @torch.no_grad()
     def image(self, state: ViewState, camera: Camera, chunks: int = 1, is_stale: IsStale = bool) -> Tensor:
@@ -174,9 +193,9 @@ class SceneRenderer:
         """
         shape = camera.height, camera.width
         if state.channel == "motion":
-            canonical = self.snapshot_at(self._canonical_moment)
+            canonical = self.snapshot_at(self._canonical_moment, state.layer)
             return with_wheel(flow_colors(*image_flow(self.module, camera, state.time, canonical))).cpu()
-        rendering = self._render(camera, Moment(state.time), chunks, is_stale)
+        rendering = self._render(camera, state, chunks, is_stale)
         if state.channel == "depth":
             image = depth_colors(rendering.depth.reshape(shape), rendering.opacity.reshape(shape))
         elif state.channel == "opacity":
@@ -187,8 +206,9 @@ class SceneRenderer:
             image = trajectories(image, rendering, camera, state.time)
         return image.cpu()
 
-    def _render(self, camera: Camera, moment: Moment, chunks: int, is_stale: IsStale) -> Rendering:
-        snapshot, parts = self.snapshot_at(moment), []
+    def _render(self, camera: Camera, state: ViewState, chunks: int, is_stale: IsStale) -> Rendering:
+        moment, parts = Moment(state.time), []
+        snapshot = self.snapshot_at(moment, state.layer)
         for chunk in range(chunks):
             if is_stale():
                 raise Cancelled
@@ -207,11 +227,13 @@ class SceneRenderer:
         return [image.cpu() for image in images]
 
     @torch.no_grad()
-    def point_at(self, camera: Camera, pixel: tuple[int, int], moment: Moment) -> Point | None:
+    def point_at(
+        self, camera: Camera, pixel: tuple[int, int], moment: Moment, layer: str = LAYERS[0]
+    ) -> Point | None:
         """Return the world point that a pixel (column, row) shows; None if it shows nothing solid."""
         column, row = (min(max(p, 0), n - 1) for p, n in zip(pixel, (camera.width, camera.height)))
         view = View(camera, torch.tensor([row * camera.width + column]))
-        rendering = self.module.render(view, moment, self.background, self.snapshot_at(moment))
+        rendering = self.module.render(view, moment, self.background, self.snapshot_at(moment, layer))
         if float(rendering.opacity) < _SOLID:
             return None
         rays = view.rays()
@@ -275,6 +297,12 @@ class Viewer:
         return tuple(channel for channel in common if channel != SPLATS or not others)
 
     @property
+    def layers(self) -> tuple[str, ...]:
+        """Which layers all renderers have."""
+        has_layers = bool(self.renderers) and all(len(renderer.layers) > 1 for renderer in self.renderers)
+        return LAYERS if has_layers else LAYERS[:1]
+
+    @property
     def can_follow(self) -> bool:
         """Whether points can be followed in all renderers."""
         return bool(self.renderers) and all(renderer.can_follow for renderer in self.renderers)
@@ -283,6 +311,7 @@ class Viewer:
         """Drop what the present methods cannot show, as those of an earlier stage could."""
         channels = self.channels
         state = state if state.channel in channels else replace(state, channel=channels[0])
+        state = state if state.layer in self.layers else replace(state, layer=LAYERS[0])
         return state if self.can_follow else replace(state, trajectories=False, followed=())
 
     def prepare(self, state: ViewState) -> None:
@@ -322,7 +351,8 @@ class Viewer:
         camera = self._camera(state, width, height)
         number = min(int(x * len(self.renderers)), len(self.renderers) - 1)
         column = int(x * width) - number * (camera.width + _GAP)
-        return self.renderers[number].point_at(camera, (column, int(y * height)), Moment(state.time))
+        pixel, moment = (column, int(y * height)), Moment(state.time)
+        return self.renderers[number].point_at(camera, pixel, moment, state.layer)
 
 
 def on_white(image: Tensor, width: int, height: int) -> Tensor:

@@ -58,10 +58,10 @@ class Session:
         self.closed = False
 
     def change(self, **changes) -> None:
-        """Change parts of the state. A new camera, time or channel leaves the training view."""
+        """Change parts of the state. A new camera, time, channel or layer leaves the training view."""
         if "time" in changes:
             changes["time"] = min(1.0, max(0.0, changes["time"]))
-        if "training_view" not in changes and changes.keys() & {"pose", "time", "channel"}:
+        if "training_view" not in changes and changes.keys() & {"pose", "time", "channel", "layer"}:
             changes["training_view"] = None
         with self._lock:
             self.state = replace(self.state, **changes)
@@ -163,7 +163,8 @@ class Session:
         width, full_rows = self.full_size()
         rows = full_rows
         if state.drawn_by_browser:
-            self.page.show_splats(viewer.renderers[0].module.method.ellipsoids(state.time))
+            method = viewer.renderers[0].method_of(state.layer)
+            self.page.show_splats(method.ellipsoids(state.time))
             seconds, about = self._clock() - begun, "drawn by the browser, one colour from all sides"
         else:
             # How long an image takes says nothing of those of other kinds.

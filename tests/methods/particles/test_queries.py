@@ -1,12 +1,14 @@
-"""Where matter is, how far it reaches, where points go, and the ellipsoids that others draw."""
+"""Where matter is, how far it reaches, where points go, the ellipsoids that others draw, and layers."""
+
+from dataclasses import replace
 
 import pytest
 import torch
 
-from forewarp.methods.method import HasEllipsoids
+from forewarp.methods.method import HasEllipsoids, HasLayers
 from forewarp.methods.particles.model import pinhole_of
 from forewarp.ops.gaussians import Gaussians, moved, project, project_reference
-from forewarp.scene.view import Moment
+from forewarp.scene.view import Moment, View
 from tests.support.gaussians import NO_TINTS, still
 from tests.support.particles import EVERY, module_with, shaken, small_data
 
@@ -56,3 +58,66 @@ def test_where_there_is_nothing_to_see_there_are_no_bounds_and_all_particles_are
     method.opacity.data.fill_(-9.0)
     assert method.bounds([0.0, 1.0]) is None
     assert len(method.matter()) == len(method.means)
+
+
+def pulled(pixels, where=lambda points: points[:, 0] > 0):
+    """Particles of which one side goes to and fro along y, ``pixels`` from its mean place at most."""
+    method = module_with(DATA, **EVERY).method
+    camera = DATA.scene.train[0].camera
+    reach = pixels * float((camera.center - method.means.data.mean(0)).norm()) / camera.fx
+    moves = where(method.nodes.positions)
+    method.nodes.translations.data[moves, :, 1] = reach * torch.linspace(-1, 1, method.nodes.curve.count)
+    method.skinning.links = method.skinning.links[:, :1].contiguous()  # each follows one node alone
+    for name in ("shares", "logits"):
+        rows = getattr(method.skinning, name).data[:, :1]
+        part = torch.ones_like(rows) if name == "shares" else torch.zeros_like(rows)
+        setattr(method.skinning, name, part if name == "shares" else torch.nn.Parameter(part))
+    return method, moves[method.skinning.links[:, 0].long()]
+
+
+def test_what_moves_is_seen_to_move_and_what_rests_is_not():
+    method, moves = pulled(6.0)
+    assert isinstance(method, HasLayers)
+    found = method.in_motion(DATA.scene.train)
+    assert 0.2 < float(moves.float().mean()) < 0.8
+    assert float((found == moves).float().mean()) > 0.9  # but where the median has some of both
+    method.skinning.release(torch.arange(len(moves)) % 2 == 0)
+    assert not bool(method.in_motion(DATA.scene.train)[::2].any())
+    for calm in (pulled(0.3)[0], module_with(DATA, motion=None).method):
+        assert not bool(calm.in_motion(DATA.scene.train).any())
+
+
+def test_motion_along_the_rays_of_all_cameras_is_none():
+    method, _ = pulled(6.0, lambda points: points[:, 0] > -9)
+    frame = DATA.scene.train[0]
+    pose = frame.camera.camera_to_world.clone()
+    pose[:3, 3] -= 200 * pose[:3, 2]  # so far away that its rays are parallel
+    camera = replace(frame.camera, camera_to_world=pose, fx=50 * frame.camera.fx, fy=50 * frame.camera.fy)
+    ahead = camera.camera_to_world[:3, 2].float()
+    translations = method.nodes.translations.data
+    translations.copy_(translations[..., 1:2] * ahead)
+    frames = [replace(frame, camera=camera, time=i / 9) for i in range(10)]
+    assert not bool(method.in_motion(frames).any())
+    translations.copy_(
+        translations.norm(dim=-1, keepdim=True).mul(translations[..., :1].sign()) * pose[:3, 0]
+    )
+    assert float(method.in_motion(frames).float().mean()) > 0.5
+
+
+def test_a_layer_is_some_of_the_particles_and_shares_of_layers_fill_the_picture():
+    method = shaken(module_with(DATA, **EVERY)).method
+    rows, view = torch.arange(len(method.means)) % 3 == 1, View(DATA.scene.train[1].camera)
+    part, whole = method.only(rows), method.at(Moment(0.4))
+    for name in ("centers", "roots", "opacity", "harmonics"):
+        found, wanted = (getattr(m.ellipsoids(0.4), name) for m in (part, method))
+        torch.testing.assert_close(found, wanted[rows])
+    assert part.size == ("particles", int(rows.sum()))
+    assert len(method.means) == len(rows)  # the method itself has all as before
+    with torch.no_grad():
+        shares = [whole.share(view, which) for which in (rows, ~rows)]
+        alone = part.at(Moment(0.4)).render(view, torch.zeros(3)).opacity
+        torch.testing.assert_close(sum(shares), whole.render(view, torch.zeros(3)).opacity)
+        assert bool((shares[0] <= alone + 1e-6).all())  # others hide it
+        assert float((alone - shares[0]).max()) > 0.05
+        empty = method.only(torch.zeros(0, dtype=torch.int64)).at(Moment(0.4)).render(view, torch.ones(3))
+    assert float(empty.opacity.max()) == 0

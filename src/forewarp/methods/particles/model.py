@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from typing import Any, ClassVar
 
@@ -30,6 +30,7 @@ from forewarp.ops.backend import has_kernels
 from forewarp.ops.gaussians import (
     BLUR,
     FEASIBLE,
+    FLAT,
     Gaussians,
     Pinhole,
     Warp,
@@ -127,6 +128,13 @@ class ParticlesSnapshot(Snapshot):
         depth = torch.where(opacity > _TRANSPARENT, distance / opacity.clamp(min=_TRANSPARENT), 0.0)
         return Rendering(color + through[:, None] * background.to(color), depth, opacity)
 
+    def share(self, view: View, rows: Tensor) -> Tensor:
+        """See ``HasShares``: render these particles white, all others black."""
+        flat = torch.where(rows, 0.5, -0.5).to(self.gaussians.colors)[:, None, None] / FLAT
+        painted = self.gaussians._replace(colors=flat.expand(-1, 1, 3).contiguous())
+        plain = replace(self, gaussians=painted, color_basis=self.color_basis[:0])
+        return plain.render(view, flat.new_zeros(3)).rgb[:, 0]
+
     def holds(self, moment: Moment) -> bool:
         """Return whether it is the same time; which camera looks does not matter."""
         return moment.time == self.moment.time
@@ -155,7 +163,7 @@ class Particles(Method):
     # Scene queries: see ``methods.method``.
     matter, bounds, trajectories = queries.matter, queries.bounds, queries.trajectories
     ellipsoids, template, movement = queries.ellipsoids, queries.template, queries.movement
-    moving = queries.moving
+    moving, in_motion, only = queries.moving, queries.in_motion, queries.only
 
     def __init__(self, start: Start, *, width: float = 0.05, blur: float = BLUR, **choices) -> None:
         super().__init__()

@@ -1,11 +1,13 @@
-"""Scene queries: point cloud, bounds, trajectories, ellipsoids.
+"""Scene queries: point cloud, bounds, trajectories, ellipsoids, layers.
 
 These functions are methods of ``Particles``; see ``methods.method``.
 """
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import torch
@@ -14,15 +16,21 @@ from torch import Tensor
 from forewarp.fields.moving import MovingGaussians, NodeMotion
 from forewarp.methods.particles.density import most_opaque
 from forewarp.methods.particles.nodes import nearest
+from forewarp.methods.rows import keep_rows
 from forewarp.ops.gaussians import FLAT, Warp, moved, rotations
 from forewarp.scene.box import Box
+from forewarp.scene.camera import Camera
 from forewarp.scene.cloud import Cloud, Ellipsoids
+from forewarp.scene.frame import Frame, spread
 
 if TYPE_CHECKING:
     from forewarp.methods.particles.model import Particles
 
 _SOLID, _VISIBLE = 0.1, 0.02  # opacity from which matter bounds the scene; from which there is any
 _NEIGHBOURS = 4  # particles that a point goes with
+_FRAMES, _CAMERAS = 32, 8  # at whose times, and from which of them, motion is looked at
+_MOVES = 1.5  # pixels from the mean place, from which on it is seen that a particle moves
+_ALIKE = 9  # particles beside each other, whose median counts
 _COLLAPSED = 0.05  # of the longest axis: what a blend of maps has pressed flatter is not stretched again
 
 
@@ -116,6 +124,46 @@ def moving(self: Particles) -> MovingGaussians:
     harmonics, opacity = template(self).harmonics, self.opacity.data[:, 0]
     canonical = self.means.data, self.scales.data, self.quaternions.data, opacity, harmonics
     return MovingGaussians(*canonical, *over_time, self.canonical_time, self.blur, motion)
+
+
+@torch.no_grad()
+def in_motion(self: Particles, frames: Sequence[Frame]) -> Tensor:
+    """See ``HasLayers``. A particle moves that goes more than ``_MOVES`` pixels from its mean place, in half
+    of some cameras' images. Motion along their rays, of which images say little, is none; neither is that at
+    times of which no image shows the place. Single particles stray: the median with the nearest others
+    counts. What rests, or follows only nodes that have stopped, does not move.
+
+    Cost: 256 places in an image for each particle.
+    """
+    if self.nodes is None:
+        return torch.zeros(len(self.means), dtype=torch.bool, device=self.means.device)
+    frames = [frames[number] for number in spread(len(frames), _FRAMES)]
+    places = torch.stack([moved(self.means.data, self.warp(frame.time))[0] for frame in frames])
+    shown = torch.stack([_in_image(frame.camera, now) for frame, now in zip(frames, places)])  # (F, N)
+    ranges = []
+    for number in spread(len(frames), _CAMERAS):
+        pixels, depth = replace(frames[number].camera, lens=None).project(places)
+        mean = (pixels * shown[..., None]).sum(0) / shown.sum(0).clamp(min=1)[:, None]
+        away = ((pixels - mean).norm(dim=-1) * shown).amax(0)
+        ranges.append(torch.where(((depth > 0) | ~shown).all(0), away, torch.nan))
+    ranges = torch.stack(ranges).nanmedian(0).values.nan_to_num()
+    beside = nearest(self.means.data, self.means.data, _ALIKE)[1]
+    return (ranges[beside].median(-1).values > _MOVES) & (self.skinning.shares.sum(-1) > 0)
+
+
+def _in_image(camera: Camera, points: Tensor) -> Tensor:
+    """Return which points (N, 3) lie before a camera and within its image."""
+    pixels, depth = camera.project(points)
+    inside = (pixels >= 0) & (pixels < pixels.new_tensor([camera.width, camera.height]))
+    return inside.all(-1) & (depth > 0)
+
+
+@torch.no_grad()
+def only(self: Particles, rows: Tensor) -> Particles:
+    """See ``HasLayers``."""
+    part = copy.deepcopy(self)
+    keep_rows(part, rows.nonzero()[:, 0] if rows.dtype == torch.bool else rows)
+    return part
 
 
 @torch.no_grad()

@@ -1,0 +1,83 @@
+"""What moves of a fitted scene, against the truth of the procedural ones."""
+
+from types import SimpleNamespace
+
+import imageio.v3 as iio
+import numpy as np
+import pytest
+import torch
+from omegaconf import OmegaConf
+
+from forewarp import load
+from forewarp.cli.render import write_film
+from forewarp.evaluation.images import moving_share
+from forewarp.evaluation.layers import layer_of, moving_rows
+from forewarp.synth.raycast import Posed, camera_rays
+from forewarp.synth.world import World
+from tests.support.configs import CONF
+from tests.support.particles import EVERY, module_with, shaken, small_data
+
+DATA = small_data()
+
+
+def true_mask(world, frame, frames):
+    """Which pixels (H, W) of a frame show what goes 1.5 pixels and more from its mean place in ``frames``."""
+    hits = Posed(world, frame.time).first_hits(*camera_rays(frame.camera))
+    times = np.linspace(0, 1, 17)
+    places = np.stack([world.points(hits.face, hits.barycentric, time) for time in times])
+    pixels = torch.stack([f.camera.project(torch.from_numpy(places))[0] for f in frames])
+    away = (pixels - pixels.mean(1, keepdim=True)).norm(dim=-1).amax(1).median(0).values
+    mask = np.zeros(frame.camera.width * frame.camera.height, bool)
+    mask[hits.ray] = away > 1.5
+    return mask.reshape(frame.camera.height, frame.camera.width)
+
+
+def test_a_layer_without_particles_is_refused_unless_it_will_do():
+    method, frames = module_with(DATA).method, DATA.scene.train
+    assert layer_of(method, "all", frames) is method
+    assert len(layer_of(method, "resting", frames).means) == len(method.means)
+    with pytest.raises(
+        ValueError, match="layer: expected some particles that move, but got none in this run"
+    ):
+        layer_of(method, "moving", frames)
+    assert len(layer_of(method, "moving", frames, may_be_empty=True).means) == 0
+
+
+def test_a_film_of_a_layer_has_the_masks_of_the_whole_scene(tmp_path, monkeypatch):
+    module = shaken(module_with(DATA, **EVERY))
+    rows = torch.arange(len(module.method.means)) % 2 == 0
+    monkeypatch.setattr(type(module.method), "in_motion", lambda self, frames: rows)
+    method, config = module.method, OmegaConf.load(CONF / "render.yaml")
+    config.update({"masks": "true", "layer": "moving", "frames": 3, "size": 24, "format": "png"})
+    film = write_film(config, SimpleNamespace(folder=tmp_path, datamodule=DATA), module)
+    assert film == tmp_path / "videos" / "fixed_moving"
+    assert len(module.method.means) == int(rows.sum())
+    masks = [iio.imread(tmp_path / "videos" / "fixed_moving_masks" / f"{i:04d}.png") for i in range(3)]
+    camera = DATA.targets("test")[0].frame.camera.resized(24, 24)
+    for mask, time in zip(masks, (0.0, 0.5, 1.0)):
+        share = moving_share(method, rows, camera, time).numpy()
+        np.testing.assert_array_equal(mask == 255, share > 0.5)
+        assert 0.02 < (mask == 255).mean() < 0.98
+        assert set(np.unique(mask)) == {0, 255}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["rigid", "quick"])
+def test_the_mask_of_what_moves_is_that_of_the_scene_itself(ok, tmp_path, name):
+    words = [
+        f"data.root={tmp_path}",
+        "data.synthesis.test_views=[4,4,0]",
+        "logger=none",
+        "sheets=0",
+        "seed=0",
+    ]
+    budget = ["budget.minutes=null", "budget.iterations=6000", "trainer=cpu", "threads=1"]
+    ok("train", f"scene=specimen_{name}", "model=particles", *words, *budget, f"run={tmp_path}/run")
+    scene, world = load(tmp_path / "run"), World(name)
+    rows, frames = moving_rows(scene.method, scene.scene.train), scene.scene.train[::8]
+    both = either = 0
+    for frame in scene.frames("test"):
+        found = moving_share(scene.method, rows, frame.camera, frame.time).numpy() > 0.5
+        truth = true_mask(world, frame, frames)
+        both, either = both + (found & truth).sum(), either + (found | truth).sum()
+    assert both / either >= 0.9, both / either
