@@ -107,6 +107,43 @@ def test_a_subject_at_one_side_is_not_taken_for_inverted(aside):
     assert "inverted" not in said_of(torso(*aside))
 
 
+def of_test(**changes):
+    """The scene whose test cameras are changed."""
+    test = tuple(replace(f, camera=replace(f.camera, **changes)) for f in SCENE.test)
+    return replace(SCENE, test=test)
+
+
+def far_off(scale):
+    pose = SCENE.test[0].camera.camera_to_world.clone()
+    pose[:3, 3] *= scale
+    return of_test(camera_to_world=pose)
+
+
+def with_depth(value):
+    depth = torch.full((16, 16), value)
+    return replace(SCENE, test=(replace(SCENE.test[0], load_depth=lambda: depth), *SCENE.test[1:]))
+
+
+@pytest.mark.parametrize(
+    ("scene", "said"),
+    [
+        (far_off(1000), r"3 of 3 test images see nothing of the box .*in other units"),
+        (of_test(fx=60.0, fy=60.0), r"focal length of test images is 3.8 of .* training images 1.2 to 1.2"),
+        (
+            with_depth(3000.0),
+            "depth is 3000 in the median, with near at 1 and far at 5.5; write it in the units",
+        ),
+        (
+            replace(SCENE, train=[replace(f, camera=replace(f.camera, fx=2.0)) for f in SCENE.train]),
+            "images are 152 degrees wide, as if focal lengths were in millimetres; write them in pixels",
+        ),
+    ],
+)
+def test_test_images_and_focal_lengths_of_other_units_are_told(scene, said):
+    assert re.search(said, next(remarks(scene)))
+    assert list(remarks(with_depth(3.0))) == []
+
+
 def test_images_without_a_subject_are_refused_and_few_of_them_told():
     with pytest.raises(
         SceneError, match="r_0.*expected a subject in some .* 0 everywhere in all 8; mend alpha"
@@ -329,7 +366,10 @@ def test_all_cameras_of_a_long_walk_are_asked_for_points_at_no_cost_of_their_siz
         frames.append(Frame(f"{i}", i / 399, camera, lambda: torch.zeros(1)))
     points = torch.stack([torch.linspace(0, 399, 2000), torch.full((2000,), 3.0), torch.zeros(2000)], 1)
     box = Box((-1, 0, -1), (400, 4, 1))
-    assert list(remarks(replace(SCENE, train=tuple(frames), box=box, has_alpha=False, still=points))) == []
+    assert (
+        list(remarks(replace(SCENE, train=tuple(frames), test=(), box=box, has_alpha=False, still=points)))
+        == []
+    )
     assert (len(bytes_of), sum(bytes_of)) == (400, 400)
 
 

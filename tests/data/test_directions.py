@@ -4,7 +4,13 @@ import pytest
 import torch
 
 from forewarp.data.cameras import FLIP
-from forewarp.data.directions import check_directions, inverted, opposite, other_readings
+from forewarp.data.directions import (
+    check_directions,
+    inverted,
+    opposite,
+    other_readings,
+    transposed,
+)
 from forewarp.data.files import SceneError
 from tests.support.written_scenes import around
 
@@ -16,6 +22,13 @@ def in_a_row():
     for i, pose in enumerate(poses):
         pose[:3, 3] += i * pose[:3, 0]
     return poses
+
+
+def by_inverse(poses):
+    """Poses beside whose rotations the translations of their inverses stand."""
+    changed = poses.clone()
+    changed[:, :3, 3] = torch.linalg.inv(poses)[:, :3, 3]
+    return changed
 
 
 def test_poses_written_in_another_way_are_recognised():
@@ -32,6 +45,20 @@ def test_poses_written_in_another_way_are_recognised():
         with pytest.raises(SceneError, match=f"; set {said}, or"):
             check_directions(misread, "t.json", inverse=False)
     check_directions(in_a_row(), "t.json", inverse=False)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (transposed, "only if rotations are transposed; write them so, or set data.axes=opengl"),
+        (by_inverse, "only if translations are of world-to-camera matrices; write them so"),
+        (lambda poses: transposed(opposite(poses)), "transposed and axes are OpenCV's; write them so"),
+    ],
+)
+def test_half_inverted_poses_are_recognised(change, said):
+    misread = opposite(change(opposite(torch.stack(around()))))
+    with pytest.raises(SceneError, match=said):
+        check_directions(list(misread), "t.json", inverse=False)
 
 
 def test_several_ways_are_named():

@@ -125,6 +125,11 @@ BAD = {
         (T, {"frames.1.transform_matrix": GONE}, r"frames\[1\].transform_matrix: expected 4 x 4 .*None"),
         (
             T,
+            lambda c: [f.update(transform_matrix=[*zip(*f["transform_matrix"])]) for f in c["frames"]],
+            r"the last row 0 0 0 1, but got \[.*; transpose it",
+        ),
+        (
+            T,
             {"frames.1.time": "1"},
             r"frames\[1\].time: expected a number in \[-1e\+20, 1e\+20\], but got '1'",
         ),

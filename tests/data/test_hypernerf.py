@@ -104,6 +104,19 @@ def test_time_id_counts_before_warp_id_and_entries_of_no_item_not_at_all(tmp_pat
     assert read_scene(tmp_path, "toy").test[0].time == 0.25
 
 
+def test_time_ids_in_two_units_and_of_one_moment_are_named(tmp_path):
+    folder = write_rig(tmp_path / "toy", rig(times=24))
+    val = json.loads((folder / "dataset.json").read_text())["val_ids"]
+    edit(folder / "metadata.json", lambda c: [c[i].update(time_id=100 * c[i]["time_id"]) for i in val])
+    with pytest.raises(
+        SceneError, match=r"times of train frames: expected one unit .* 0 to 2300, but got 0 to"
+    ):
+        read_scene(tmp_path, "toy")
+    edit(folder / "metadata.json", lambda c: [entry.update(time_id=7) for entry in c.values()])
+    (line,) = read_scene(tmp_path, "toy").protocol["assumed"]
+    assert line.endswith("metadata.json: all items are of time 7: one moment")
+
+
 def test_no_item_leaves_the_scene(tmp_path):
     folder = write_rig(tmp_path / "toy")
     edit(folder / "dataset.json", {"ids.0": "../x", "train_ids.0": "../x"})

@@ -258,6 +258,13 @@ def test_two_folders_of_one_number_are_named(toy):
         read_scene(toy.parent, "toy")
 
 
+def test_masks_of_another_kind_are_named(toy):
+    mask = toy / "img" / "0" / "mask" / "img_0000.jpg"
+    mask.rename(mask.with_suffix(".png"))
+    with pytest.raises(SceneError, match=r"img_0000.png: expected .*, but got another; write JPEG, \.jpg"):
+        read_scene(toy.parent, "toy")
+
+
 def test_an_image_that_is_missing_in_the_first_frame_is_named(toy):
     (toy / "img" / "0" / "img_0000.jpg").unlink()
     with pytest.raises(SceneError, match=r"0/img_0000\.jpg: expected"):

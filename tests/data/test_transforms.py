@@ -236,6 +236,17 @@ def test_times_in_one_unit_are_not_refused(train, test):
     check_times({k: {f"{k}/{i}": t for i, t in enumerate(of)} for k, of in times.items()}, "t.json")
 
 
+def test_times_under_another_key_are_named(tmp_path):
+    folder = write_dnerf(tmp_path / "toy")
+    for file in folder.glob("*.json"):
+        edit(file, lambda c: [f.update(timestamp=f.pop("time")) for f in c["frames"]])
+    lines = dnerf.read_scene(tmp_path, "toy").protocol["assumed"]
+    assert (
+        f"{folder}/transforms_train.json: timestamp of the frames is not read; call it time, if" in lines[0]
+    )
+    assert "taken from the numbers in the images' names" in lines[-1]
+
+
 def test_what_is_not_there_is_left_out_and_told(tmp_path):
     folder = write_dnerf(tmp_path / "toy", size=(6, 8))
     (folder / "train" / "r_1.png").unlink()

@@ -61,7 +61,8 @@ def pose_of(value: object, where: str) -> np.ndarray:
         got = f"determinant {determinant:.4g} and columns that are off orthonormal by {error:.2g}"
         raise mismatch(where, "a rotation", got, "remove scale and mirroring from the camera")
     if np.abs(matrix[3] - [0, 0, 0, 1]).max() > _ROTATION_TOLERANCE:
-        raise mismatch(where, "the last row 0 0 0 1", matrix[3].tolist())
+        advice = "transpose it" if not matrix[:3, 3].any() else ""
+        raise mismatch(where, "the last row 0 0 0 1", matrix[3].tolist(), advice)
     return matrix
 
 

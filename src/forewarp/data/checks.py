@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 
 import torch
@@ -12,7 +13,7 @@ from forewarp.data.directions import common_point
 from forewarp.data.files import mismatch
 from forewarp.scene.box import Box, Lattice
 from forewarp.scene.camera import Camera, focus_point
-from forewarp.scene.frame import Scene, sightings, spread
+from forewarp.scene.frame import Frame, Scene, sightings, spread
 
 _LOOKED_AT = 8  # training images whose alpha is looked at
 _PIXELS = 4000  # of each
@@ -23,6 +24,7 @@ _SIDE, _HOLLOW = (
 )  # of one whose subject crosses the edges: at two opposite sides, in its middle ninth
 _WITHIN = 5  # points along a side of the box that cameras are asked for
 _FAINT = 8  # of 255: alpha that is nowhere above it was written as 0 and 1
+_WIDEST, _ZOOMED = 130, 1.25  # degrees of a pinhole camera; focal lengths of test and training images
 _CUT_OFF, _FEW = 0.1, 0.5  # share of the subject beyond the box; of pixels and points that is too few
 # What mends near or far, the box, and all three, by format; "" is any other.
 _REMEDIES = {
@@ -49,8 +51,8 @@ def remarks(scene: Scene) -> Iterator[str]:
     Cost: eight training images are decoded, which training does anyway; all, where those show nothing.
     """
     aim = common_point([frame.camera.camera_to_world for frame in scene.train])
-    aside = [] if aim is None else list(_aimed(scene, aim))
-    yield from aside
+    aside = list(_angles(scene)) or ([] if aim is None else list(_aimed(scene, aim)))
+    yield from aside or _of_test_images(scene)
     if scene.has_alpha:
         yield from _silhouettes(scene, bounded=not aside)
     if masked := [frame.load_valid for frame in scene.train if frame.load_valid is not None]:
@@ -70,6 +72,38 @@ def remarks(scene: Scene) -> Iterator[str]:
             yield (
                 f"training cameras see {share:.0%} of the {len(scene.still)} points that never move, as if "
                 "they were in other units or axes; remove them, or write them anew"
+            )
+
+
+def _angles(scene: Scene) -> Iterator[str]:
+    """Say that cameras see more than a pinhole camera can show."""
+    widest = max(max(f.camera.width / f.camera.fx, f.camera.height / f.camera.fy) for f in scene.train)
+    if (degrees := math.degrees(2 * math.atan(widest / 2))) > _WIDEST:
+        line = f"training images are {degrees:.0f} degrees wide, as if focal lengths were in millimetres"
+        yield f"{line}; write them in pixels"
+
+
+def _of_test_images(scene: Scene) -> Iterator[str]:
+    """Compare places, angles and depths of test images with those of training images and the box."""
+    if (blind := blind_frames(scene, scene.test)) > _CUT_OFF * len(scene.test):
+        line = f"{blind} of {len(scene.test)} test images see nothing of the box {bounds(scene)}"
+        yield f"{line}, as if their poses were in other units; write them as those of training images"
+    focal = [f.camera.fx / max(f.camera.width, f.camera.height) for f in scene.train]
+    of_test = [f.camera.fx / max(f.camera.width, f.camera.height) for f in scene.test]
+    middle = float(torch.tensor(of_test or focal).median())
+    if not min(focal) / _ZOOMED < middle < max(focal) * _ZOOMED:
+        yield (
+            f"the focal length of test images is {middle:.2g} of their longer side and that of training "
+            f"images {min(focal):.2g} to {max(focal):.2g}; compare both"
+        )
+    deep = next((frame for frame in scene.test if frame.load_depth is not None), None)
+    depth = None if deep is None else deep.load_depth()
+    if depth is not None and bool((depth > 0).any()):
+        away, near, far = float(depth[depth > 0].median()), deep.camera.near, deep.camera.far
+        if not near < away < far:
+            yield (
+                f"{deep.name}: its depth is {_length(scene, away)} in the median, with near at "
+                f"{_length(scene, near)} and far at {_length(scene, far)}; write it in the units of the poses"
             )
 
 
@@ -194,9 +228,9 @@ def check_seen(scene: Scene) -> None:
     )
 
 
-def blind_frames(scene: Scene) -> int:
-    """Count the training frames whose camera sees nothing of the box between its near and far planes: neither
-    through nine of its pixels, nor any of 125 points of the box, which may lie between these.
+def blind_frames(scene: Scene, frames: Sequence[Frame] | None = None) -> int:
+    """Count the frames, by default of training, whose camera sees nothing of the box between its near and far
+    planes: neither through nine of its pixels, nor any of 125 points of the box, which may lie between these.
     """
     lattice = Lattice.of_count(scene.box, _WITHIN**3)
     points = lattice.to_world(lattice.all_voxels()).double()
@@ -209,4 +243,4 @@ def blind_frames(scene: Scene) -> int:
         inside &= (away > camera.near) & (away < camera.far)
         return bool(inside.any() or meets(camera, scene.box, nine_pixels(camera)).any())
 
-    return sum(not sees(frame.camera) for frame in scene.train)
+    return sum(not sees(frame.camera) for frame in (scene.train if frames is None else frames))

@@ -11,6 +11,7 @@ import torch
 from forewarp.data.cameras import FLIP
 from forewarp.data.files import mismatch
 
+_Change = Callable[[torch.Tensor], torch.Tensor]  # of poses (N, 4, 4)
 _LEAST_CAMERAS = 4  # of which can be told whether they look at something in common
 _ALL = 0.9  # share of cameras before which a common point must lie
 _MEET, _MISS = 0.15, 0.5  # miss of the axes in shares of the distance: they meet in a point, they do not
@@ -47,18 +48,30 @@ def check_directions(
         expected, got = "cameras that look at one thing", f"{1 - ahead:.0%} of them that look away from it"
         advice = advice or "write all in the same axes, or set data.axes=opengl if they are right"
         raise mismatch(where, expected, got, advice)
-    # What was read as ``matrix @ FLIP`` is taken back, inverted, and given OpenGL's axes.
-    changes = {"data.inverse=true": lambda poses: opposite(inverted(opposite(poses)))}
-    ways = [] if inverse else other_readings(poses, changes | {"data.axes=opencv": opposite})
-    if ways:
+    if inverse:
+        return
+
+    def of_file(change: _Change) -> _Change:
+        """Change matrices as they are in the file, where they were read as ``matrix @ FLIP``."""
+        return lambda poses: opposite(change(opposite(poses)))
+
+    whole = {"data.inverse=true": of_file(inverted), "data.axes=opencv": opposite}
+    halves = {
+        "rotations are transposed": of_file(transposed),
+        "translations are of world-to-camera matrices": of_file(by_translation),
+        "axes are OpenCV's": opposite,
+    }
+    if keys := other_readings(poses, whole):
         got = "cameras that look at nothing in common, as their inverses do"
-        advice = advice or f"set {ways[0].replace(' and ', ' ')}, or data.axes=opengl if they are right"
+        advice = advice or f"set {keys[0].replace(' and ', ' ')}, or data.axes=opengl if they are right"
+        raise mismatch(where, "camera-to-world matrices", got, advice)
+    if ways := other_readings(poses, halves):
+        got = f"cameras that look at one thing only if {', or if '.join(ways)}"
+        advice = advice or "write them so, or set data.axes=opengl if they are right"
         raise mismatch(where, "camera-to-world matrices", got, advice)
 
 
-def other_readings(
-    poses: Sequence[torch.Tensor], changes: Mapping[str, Callable[[torch.Tensor], torch.Tensor]]
-) -> list[str]:
+def other_readings(poses: Sequence[torch.Tensor], changes: Mapping[str, _Change]) -> list[str]:
     """Name the changes by which all cameras look at one point, in each way that needs the fewest.
 
     There are none if poses may be right as they are: if their cameras look at about one point or, whatever is
@@ -89,6 +102,20 @@ def other_readings(
 def opposite(poses: torch.Tensor) -> torch.Tensor:
     """Take poses (N, 4, 4) with OpenGL's axes for those of OpenCV, or the other way round."""
     return poses @ torch.from_numpy(FLIP)
+
+
+def transposed(poses: torch.Tensor) -> torch.Tensor:
+    """Invert the rotations of poses (N, 4, 4) alone."""
+    changed = poses.clone()
+    changed[:, :3, :3] = poses[:, :3, :3].mT
+    return changed
+
+
+def by_translation(poses: torch.Tensor) -> torch.Tensor:
+    """Take the places of poses (N, 4, 4) for translations of their inverses."""
+    changed = poses.clone()
+    changed[:, :3, 3:] = -poses[:, :3, :3] @ poses[:, :3, 3:]
+    return changed
 
 
 def inverted(poses: torch.Tensor) -> torch.Tensor:

@@ -65,6 +65,7 @@ from forewarp.data.transforms import (
     pose_in,
     time_in,
     times_of,
+    unread_times,
     with_images,
     with_suffix,
 )
@@ -338,7 +339,7 @@ def _read_file(
         by_angle = entry.get("camera_angle_x") is not None
         by_angle &= entry.get("fl_x") is None and entry.get("fl_y") is None
         records.append(_Record(time_in(entry), camera, image, has_alpha, mask, depth, ability, by_angle))
-    assumed += turned_by_exif(turned, path)
+    assumed += turned_by_exif(turned, path) + unread_times(entries, str(path))
     return records, assumed + left_aside(zip((entry for entry, _ in there), (r.camera for r in records)))
 
 

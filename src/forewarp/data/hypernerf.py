@@ -32,10 +32,10 @@ from forewarp.data.cameras import (
     frustum_box,
     pose_of,
 )
-from forewarp.data.directions import opposite, other_readings
+from forewarp.data.directions import by_translation, opposite, other_readings, transposed
 from forewarp.data.files import Entry, inside, mismatch, number, read_json, remove, scene_folder, whole
 from forewarp.data.images import StoredImage, check_pixels, inspect_image, turned_by_exif, write_image
-from forewarp.data.transforms import check_pinhole, with_images, with_suffix
+from forewarp.data.transforms import check_pinhole, check_times, with_images, with_suffix
 from forewarp.files import write_json
 from forewarp.scene.camera import Camera, Lens
 from forewarp.scene.frame import Frame, Scene, Truth, middle_of
@@ -46,23 +46,9 @@ _MOST_MOMENTS = 1e9
 _EVERY = 4  # the published interpolation protocol: train on every fourth, test midway between
 
 
-def _transposed(poses: Tensor) -> Tensor:
-    """Invert the rotations of poses (N, 4, 4) alone."""
-    changed = poses.clone()
-    changed[:, :3, :3] = poses[:, :3, :3].mT
-    return changed
-
-
-def _by_translation(poses: Tensor) -> Tensor:
-    """Take the places of poses (N, 4, 4) for translations of their inverses."""
-    changed = poses.clone()
-    changed[:, :3, 3:] = -poses[:, :3, :3] @ poses[:, :3, 3:]
-    return changed
-
-
 _READINGS = {  # what else may be in a camera file, with what mends it
-    "orientation is camera-to-world (transpose it)": _transposed,
-    "position is the translation t of a world-to-camera matrix (write -orientation^T t)": _by_translation,
+    "orientation is camera-to-world (transpose it)": transposed,
+    "position is the translation t of a world-to-camera matrix (write -orientation^T t)": by_translation,
     "the axes are OpenGL's (then negate the last two rows of orientation)": opposite,
 }
 
@@ -108,7 +94,7 @@ def read_scene(root: str | Path, scene: str, *, scale: int = 2, box: Sequence[fl
         raise mismatch(f"{world.file}: near, far", "near < far", f"{near:g} and {far:g}")
     normalised = Normalisation(center, size, near, far)
     how, ids, train_ids, test_ids = _read_split(folder / "dataset.json")
-    times, camera_ids = _read_items(folder / "metadata.json", ids)
+    times, camera_ids, numbers = _read_items(folder / "metadata.json", ids)
     where = f"{folder / 'dataset.json'}: ids"
     paths = {item: with_suffix(inside(images, item, where)) for item in ids}
     there, assumed = with_images(ids, list(paths.values()), where)
@@ -132,6 +118,11 @@ def read_scene(root: str | Path, scene: str, *, scale: int = 2, box: Sequence[fl
         return Frame(item, times[item], camera, load, camera_id=camera_ids[item])
 
     train, test = (tuple(map(frame, items)) for items in (train_ids, test_ids))
+    splits = {"train": train_ids, "val": test_ids}
+    numbered = {split: {item: numbers[item] for item in items} for split, items in splits.items()}
+    check_times(numbered, str(folder / "metadata.json"))
+    if len({*numbers.values()}) == 1:
+        assumed.append(f"{folder / 'metadata.json'}: all items are of time {numbers[ids[0]]}: one moment")
     canonical, points = middle_of(f.time for f in train), folder / "points.npy"
     protocol = {
         "dataset": "hypernerf",
@@ -290,8 +281,9 @@ def _read_split(path: Path) -> tuple[str, list[str], list[str], list[str]]:
     return "interpolation", ids, [ids[i] for i in chosen], [ids[i + _EVERY // 2] for i in chosen[:-1]]
 
 
-def _read_items(path: Path, ids: list[str]) -> tuple[dict[str, float], dict[str, int | None]]:
-    """Read the time in [0, 1] of each item of a ``metadata.json`` and its camera's number, where it has one.
+def _read_items(path: Path, ids: list[str]) -> tuple[dict[str, float], dict[str, int | None], dict[str, int]]:
+    """Read the time in [0, 1] of each item of a ``metadata.json``, its camera's number, where it has one, and
+    the number of its moment.
 
     The time is ``time_id``, or where none of ``ids`` has one ``warp_id``, between the least and the greatest
     of them. Entries of other items are not looked at.
@@ -316,7 +308,8 @@ def _read_items(path: Path, ids: list[str]) -> tuple[dict[str, float], dict[str,
             numbers[name][item] = int(number)
     first, last = min(numbers[key].values()), max(numbers[key].values())
     span = max(last - first, 1)
-    return {item: (number - first) / span for item, number in numbers[key].items()}, numbers["camera_id"]
+    times = {item: (number - first) / span for item, number in numbers[key].items()}
+    return times, numbers["camera_id"], numbers[key]
 
 
 def _write_shot(folder: Path, shot: RigShot, scales: Sequence[int]) -> None:

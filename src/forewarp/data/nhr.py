@@ -250,7 +250,8 @@ def _read_sizes(
         for place in (folder, folder / "mask"):
             if extra := sorted({path.name for path in place.glob("img_*")}.difference(names)):
                 expected = f"images of the {len(names)} cameras of CamPose.inf"
-                raise mismatch(place / extra[0], expected, "another")
+                advice = "" if extra[0].endswith(".jpg") else "write JPEG, .jpg"
+                raise mismatch(place / extra[0], expected, "another", advice)
             for k, name in enumerate(names):
                 why = f" as in img/{folders[0].name}/{name}"
                 header = inspect_image(place / name, sizes[k], why)

@@ -57,6 +57,7 @@ from forewarp.data.transforms import (
     pose_in,
     time_in,
     times_of,
+    unread_times,
     with_images,
     with_suffix,
 )
@@ -298,7 +299,7 @@ def _read_entries(
         if any(given) and not all(given):
             got = f"{sum(given)} of {len(given)} and none in frames[{given.index(False)}]"
             raise mismatch(f"{file}: frames: {key}", "one in all frames or in none", got)
-    assumed += turned_by_exif(turned, file)
+    assumed += turned_by_exif(turned, file) + unread_times(frames, str(file))
     names = [entry.name for entry in entries]
     if len(set(names)) < len(names):
         twice = next(name for i, name in enumerate(names) if name in names[:i])

@@ -48,6 +48,7 @@ _UNREAD_LENSES = ("distortion_params", "distortion", "dist_coeffs", "distortion_
 _FOCAL = ("fl_x", "fl_y", "camera_angle_x")
 _SAME_FOCAL = 0.02  # share by which two focal lengths of one camera may differ
 _OUTSIDE = 0.9  # share of a side beyond which a principal point is another image's
+_TIMES = ("timestamp", "time_stamp", "frame_time", "time_id", "t", "frame_id", "frame")  # of programs
 _MOST_TIME = 1e20
 _LEAST_SPAN, _MOST_FAR = 0.05, 0.1  # of all times: less is hardly what was meant; share that may be wrong
 _LEAST_UNIT = 0.5  # of all times, that those in [0, 1] span
@@ -180,6 +181,13 @@ def left_aside(cameras: Iterable[tuple[Entry, Camera]]) -> list[str]:
 def time_in(entry: Entry) -> float | None:
     """Read a frame's ``time``, in any unit; None where it has none."""
     return entry.number("time", -_MOST_TIME, _MOST_TIME) if "time" in entry.own else None
+
+
+def unread_times(entries: Sequence[Entry], where: str) -> list[str]:
+    """Say in a line that frames have no ``time``, but another key that may be one."""
+    keys = [] if any("time" in entry.own for entry in entries) else _TIMES
+    there = [key for key in keys if all(type(entry.own.get(key)) in (int, float) for entry in entries)]
+    return [f"{where}: {there[0]} of the frames is not read; call it time, if it is that"] if there else []
 
 
 def pose_in(entry: Entry, axes: str | None, inverse: bool) -> torch.Tensor:
