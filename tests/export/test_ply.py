@@ -1,3 +1,5 @@
+import shutil
+import subprocess
 from dataclasses import replace
 
 import numpy as np
@@ -5,17 +7,19 @@ import pytest
 import torch
 import trimesh
 from plyfile import PlyData
-from scipy.special import expit
+from scipy.special import expit, logit
 
-from forewarp.export.ply import splat_columns, write_ply
+from forewarp.export.ply import along_curve, packed_columns, splat_columns, write_ply
 from forewarp.ops.gaussians import FLAT, Gaussians
 from forewarp.scene.camera import mean_up
 from forewarp.scene.cloud import Ellipsoids
 from forewarp.scene.view import Moment, View
 from tests.export.conftest import TIMES, exporter
 from tests.support.gaussians import NO_TINTS, still
+from tests.support.tiny_scene import camera_at
 
-export = exporter("ply", degree=3, up="world")
+export = exporter("ply", degree=3, up="world", compressed=False)
+TOOL = shutil.which("splat-transform")
 LAYOUT = [
     *("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"),
     *(f"f_rest_{i}" for i in range(45)),
@@ -31,6 +35,44 @@ def read(path):
 
 def columns(table, name):
     return np.stack([table[key] for key in table if key.rstrip("0123456789").rstrip("_") == name], -1)
+
+
+def unpacked(path):
+    """The properties of a compressed file, in the same form, as the format says."""
+    file = PlyData.read(path)
+    chunk, vertex = file["chunk"], file["vertex"]
+    rows = np.arange(vertex.count) // 256
+
+    def numbers(name, *widths):
+        word, parts = np.asarray(vertex[name]).astype(np.uint64), []
+        for width in reversed(widths):
+            parts.append((word & np.uint64(2**width - 1)) / (2**width - 1))
+            word = word >> np.uint64(width)
+        return parts[::-1]
+
+    def between(names, shares):
+        ends = [
+            [np.asarray(chunk[f"{end}_{name}"], np.float64)[rows] for end in ("min", "max")] for name in names
+        ]
+        return [low + (high - low) * share for (low, high), share in zip(ends, shares)]
+
+    table = dict(zip("xyz", between("xyz", numbers("packed_position", 11, 10, 11))))
+    scales = between(("scale_x", "scale_y", "scale_z"), numbers("packed_scale", 11, 10, 11))
+    table |= {f"scale_{i}": value for i, value in enumerate(scales)}
+    *shares, opacity = numbers("packed_color", 8, 8, 8, 8)
+    table |= {f"f_dc_{i}": (value - 0.5) / FLAT for i, value in enumerate(between("rgb", shares))}
+    table["opacity"] = logit(opacity)
+    largest, *parts = numbers("packed_rotation", 2, 10, 10, 10)
+    others = [(part - 0.5) * 2**0.5 for part in parts]
+    quaternions = np.stack([(1 - sum(part**2 for part in others)) ** 0.5, *others], -1)
+    places = [[i, *(j for j in range(4) if j != i)] for i in range(4)]
+    back = np.argsort(places, -1)[np.rint(3 * largest).astype(int)]
+    turned = np.take_along_axis(quaternions, back, -1)
+    table |= {f"rot_{i}": turned[:, i] for i in range(4)}
+    for p in file["sh"].properties if "sh" in file else ():
+        steps = np.asarray(file["sh"][p.name], np.float64)
+        table[p.name] = np.where(steps == 0, -4, np.where(steps == 255, 4, (steps + 0.5) / 32 - 4))
+    return table
 
 
 def drawn(table, snapshot, camera):
@@ -72,7 +114,7 @@ def test_a_viewer_draws_the_images_of_the_run_and_the_motion_moves_the_canonical
 def test_a_file_has_the_coefficients_of_its_degree(tmp_path, degree):
     harmonics = torch.arange(2 * 9 * 3, dtype=torch.float32).reshape(2, 9, 3)
     cloud = Ellipsoids(torch.zeros(2, 3), torch.eye(3).repeat(2, 1, 1), torch.rand(2), harmonics)
-    write_ply(tmp_path / "a.ply", splat_columns(cloud, degree))
+    write_ply(tmp_path / "a.ply", {"vertex": splat_columns(cloud, degree)})
     table = read(tmp_path / "a.ply")
     count = (degree + 1) ** 2 - 1
     assert len([name for name in table if name.startswith("f_rest")]) == 3 * count
@@ -86,7 +128,7 @@ def test_extremes_are_finite(tmp_path):
     opacity, harmonics = torch.tensor([0.0, 1.0, 1.0]), torch.tensor([9.0, -9.0, 0.0])
     roots = torch.stack([torch.zeros(3, 3), torch.diag(torch.tensor([1.0, 0, 0])), torch.eye(3)])
     cloud = Ellipsoids(torch.zeros(3, 3), roots, opacity, harmonics[:, None, None].expand(3, 1, 3))
-    write_ply(tmp_path / "a.ply", splat_columns(cloud))
+    write_ply(tmp_path / "a.ply", {"vertex": splat_columns(cloud)})
     table = read(tmp_path / "a.ply")
     assert all(np.isfinite(column).all() for column in table.values())
     np.testing.assert_allclose(expit(table["opacity"]), opacity, atol=2e-6)
@@ -122,3 +164,82 @@ def test_turned_files_are_seen_by_turned_cameras_as_before(particles, tmp_path, 
     wanted = snapshot.render(View(camera), torch.ones(3)).rgb.detach()
     turned = drawn(table, snapshot, replace(camera, camera_to_world=pose))
     torch.testing.assert_close(turned, wanted, atol=2e-3, rtol=0)
+
+
+def test_compressed_files_are_as_exact_as_their_bits_and_look_the_same(particles, tmp_path):
+    plain, small = tmp_path / "plain", tmp_path / "small"
+    export(particles, plain, degree=2)
+    about = export(particles, small, compressed=True)
+    files = sorted(file.name for file in small.rglob("*.ply"))
+    assert files == [f"frame_{i:04d}.compressed.ply" for i in range(len(TIMES))]
+    assert about["degree"] == about["degree of the run"] == 2  # columns of degree 3 would be 0
+    order = along_curve(particles.method.template().centers.numpy())
+    for number, (time, camera) in enumerate(zip(TIMES, particles.cameras)):
+        whole = read(plain / "frames" / f"frame_{number:04d}.ply")
+        table = unpacked(small / "frames" / f"frame_{number:04d}.compressed.ply")
+        wanted = {name: whole[name][order] for name in table}
+        for name in ("x", "y", "z", *(f"scale_{i}" for i in range(3)), *(f"f_dc_{i}" for i in range(3))):
+            step = np.ptp(wanted[name]) / (255 if name.startswith("f_dc") else 1023)
+            np.testing.assert_allclose(table[name], wanted[name], atol=0.51 * step, err_msg=name)
+        rest = columns(wanted, "f_rest").clip(-4, 4)
+        np.testing.assert_allclose(columns(table, "f_rest"), rest, atol=0.51 / 32)
+        np.testing.assert_allclose(expit(table["opacity"]), expit(wanted["opacity"]), atol=0.51 / 255)
+        cosines = np.abs((columns(table, "rot") * columns(wanted, "rot")).sum(-1))
+        assert cosines.min() > 1 - 1e-5
+        snapshot = particles.method.at(Moment(time))
+        image = snapshot.render(View(camera), torch.ones(3)).rgb.detach()
+        assert float((drawn(table, snapshot, camera) - image).square().mean()) < 1e-4  # 40 dB
+
+
+@pytest.mark.parametrize("count", [1, 255, 257])
+def test_chunks_that_are_not_full_or_alike_are_packed(tmp_path, count):
+    harmonics = torch.full((count, 1, 3), 0.3)
+    cloud = Ellipsoids(torch.ones(count, 3), torch.eye(3).expand(count, 3, 3), torch.ones(count), harmonics)
+    write_ply(tmp_path / "a.ply", packed_columns(splat_columns(cloud, 0)))
+    file, table = PlyData.read(tmp_path / "a.ply"), unpacked(tmp_path / "a.ply")
+    assert (file["chunk"].count, file["vertex"].count) == (-(-count // 256), count)
+    assert "sh" not in file
+    np.testing.assert_array_equal(table["x"], 1)
+    np.testing.assert_allclose(table["f_dc_1"], 0.3, atol=1e-6)
+    np.testing.assert_allclose(columns(table, "rot"), [[1, 0, 0, 0]] * count, atol=1e-3)
+
+
+@pytest.mark.parametrize(("up", "axis"), [("world", "z"), ("-y", "y"), ("y", "y")])
+def test_headers_say_which_axis_is_vertical(particles, tmp_path, up, axis):
+    level = replace(particles, cameras=[camera_at(i / 8) for i in range(8)])
+    for compressed in (False, True):
+        folder = tmp_path / f"{compressed}"
+        export(level, folder, up=up, compressed=compressed)
+        (file,) = folder.glob("frames/frame_0000*")
+        assert PlyData.read(file).comments == [f"Vertical axis: {axis}"]
+
+
+def test_voxels_are_not_compressed(ball, tmp_path):
+    with pytest.raises(
+        ValueError, match="compressed: expected a run of particles, .* but got one of forward"
+    ):
+        export(ball, tmp_path / "ply", compressed=True)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(TOOL is None, reason="no splat-transform: npm install -g @playcanvas/splat-transform")
+def test_splat_transform_reads_them_and_makes_spz_and_sog_of_one_time(particles, tmp_path):
+    export(particles, tmp_path / "small", compressed=True)
+    export(particles, tmp_path / "plain", degree=2)
+
+    def turn_into(source, target):
+        subprocess.run([TOOL, "-q", "-w", "-g", "cpu", source, target], check=True, capture_output=True)
+        return target
+
+    path = tmp_path / "small" / "frames" / "frame_0001.compressed.ply"
+    back, table = read(turn_into(path, tmp_path / "back.ply")), unpacked(path)
+    for name in table:
+        np.testing.assert_allclose(back[name], table[name], atol=1e-4, err_msg=name)
+    frame = tmp_path / "plain" / "frames" / "frame_0001.ply"
+    whole = read(frame)
+    for kind, step in (("spz", 2e-3), ("sog", 0.02)):
+        made = read(turn_into(turn_into(frame, tmp_path / f"a.{kind}"), tmp_path / f"{kind}.ply"))
+        assert len(made["x"]) == len(whole["x"])
+        for axis in "xyz":
+            np.testing.assert_allclose(np.sort(made[axis]), np.sort(whole[axis]), atol=step)

@@ -16,6 +16,7 @@ What one types most:
   layer=moving|resting          only the particles that move, or those that rest
   out=FOLDER                    another folder
   degree=0|1|2|3                ply: how finely colours depend on direction
+  compressed=true               ply: about a tenth of the bytes, for SuperSplat, Spark, Babylon and others
   up=world|y|-y|z               ply, mesh: which axis points upwards; -y for SuperSplat
   resolution=N level=SHARE      mesh: points of the lattice along the longest side; opacity of the surface
   files=ply|obj                 mesh: the files

@@ -31,7 +31,7 @@ class Format(NamedTuple):
 
 
 FORMATS = {
-    "ply": Format("ply", ("degree", "up")),
+    "ply": Format("ply", ("degree", "up", "compressed")),
     "glb": Format("glb", ("quality", "seconds"), times=False),
     "mesh": Format("ply", ("resolution", "level", "files", "up"), "skimage", "export"),
     "gltf": Format("tracks", ("points", "seconds")),
@@ -40,6 +40,7 @@ FORMATS = {
 }
 # The values that an option may have: words, or numbers from a least to a most.
 CHOICES = {
+    "compressed": (False, True),
     "layer": LAYERS,
     "quality": ("compact", "lossless"),
     "files": ("ply", "obj"),
@@ -69,8 +70,10 @@ def check_option(key: str, value: object) -> None:
         ValueError: naming the values that it can have.
     """
     if key in CHOICES:
-        if value not in CHOICES[key]:
-            raise ValueError(f"{key}: expected {' or '.join(CHOICES[key])}, but got {value}")
+        choices = CHOICES[key]
+        if type(value) is not type(choices[0]) or value not in choices:
+            words = ["false", "true"] if choices == (False, True) else choices
+            raise ValueError(f"{key}: expected {' or '.join(words)}, but got {value}")
         return
     whole = key in WHOLE_NUMBERS
     least, most = WHOLE_NUMBERS[key] if whole else NUMBERS[key]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -12,30 +12,44 @@ from torch import Tensor
 
 from forewarp.export.tracks import Progress, Source, tracks_of
 from forewarp.methods.method import HasBounds, HasSolid
+from forewarp.ops.gaussians import FLAT
 from forewarp.scene.box import Box, Lattice
+from forewarp.scene.camera import mean_up
 from forewarp.scene.cloud import Ellipsoids
 from forewarp.scene.view import Moment
 
-_TYPES = {"float32": "float", "uint8": "uchar"}
+_TYPES = {"float32": "float", "uint32": "uint", "uint8": "uchar"}
 _ALL = 1 << 31  # more points than there are
+_ALONG = 0.98  # cosine of the angle between the upward direction and an axis, from which on that is vertical
 _LOGIT_EPS = 1e-6  # opacities are clamped to [eps, 1 - eps], as their logits are written
 
 
-def write_ply(path: Path, columns: Mapping[str, np.ndarray], faces: np.ndarray | None = None) -> None:
+def write_ply(
+    path: Path,
+    elements: Mapping[str, Mapping[str, np.ndarray]],
+    faces: np.ndarray | None = None,
+    comments: Sequence[str] = (),
+) -> None:
     """Write a binary little-endian PLY.
 
     Args:
         path: of the file.
-        columns: (N,) float32 or uint8 each, properties of the vertices by name, in their order.
+        elements: by name, each with its properties by name, in their order: (N,) float32, uint32 or uint8.
         faces: (F, 3) rows of the vertices of triangles; None: the file has only points.
+        comments: lines of the header.
     """
-    dtype = [(name, column.dtype.newbyteorder("<")) for name, column in columns.items()]
-    table = np.empty(len(next(iter(columns.values()))), dtype)
-    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(table)}"]
-    for name, column in columns.items():
-        table[name] = column
-        lines.append(f"property {_TYPES[column.dtype.name]} {name}")
-    parts = [table.tobytes()]
+    lines = ["ply", "format binary_little_endian 1.0", *(f"comment {comment}" for comment in comments)]
+    parts = []
+    for element, columns in elements.items():
+        table = np.empty(
+            len(next(iter(columns.values()))),
+            [(name, column.dtype.newbyteorder("<")) for name, column in columns.items()],
+        )
+        lines.append(f"element {element} {len(table)}")
+        for name, column in columns.items():
+            table[name] = column
+            lines.append(f"property {_TYPES[column.dtype.name]} {name}")
+        parts.append(table.tobytes())
     if faces is not None:
         corners = np.empty(len(faces), [("count", "u1"), ("rows", "<i4", 3)])
         corners["count"], corners["rows"] = 3, faces
@@ -74,7 +88,87 @@ def splat_columns(cloud: Ellipsoids, degree: int = 3) -> dict[str, np.ndarray]:
     return dict(zip(names, table.T))
 
 
-def export_ply(source: Source, folder: Path, progress: Progress, *, degree: int, up: str) -> dict:
+# PlayCanvas's compressed PLY: rows of a chunk; bits of three numbers packed in one; bounds of logarithms of
+# scales, and of harmonics.
+_CHUNK_ROWS, _BITS, _SCALES, _HARMONICS = 256, (11, 10, 11), 20.0, 4.0
+
+
+def packed_columns(columns: Mapping[str, np.ndarray]) -> dict[str, dict[str, np.ndarray]]:
+    """Pack the columns of Gaussians as PlayCanvas's compressed PLY has them.
+
+    256 rows are a ``chunk`` with the bounds of places, scales and colours, between which a ``vertex`` has 11,
+    10 and 11 bits for a place and for scales, and 8 for each colour and the opacity; of a quaternion it has
+    which part is largest, and 10 bits for each other. ``sh`` has 8 bits for each coefficient of direction, in
+    [-4, 4]. (The format is described by its reader and writer in playcanvas/splat-transform 2.7.)
+
+    Args:
+        columns: see ``splat_columns``; rows beside each other are best close to each other.
+
+    Returns:
+        the file's elements.
+    """
+    count = len(columns["x"])
+    rows = np.minimum(np.arange(-(-count // _CHUNK_ROWS) * _CHUNK_ROWS), count - 1).reshape(-1, _CHUNK_ROWS)
+    chunk, vertex = {}, {}
+
+    def packed(values: list[np.ndarray], names: Sequence[str], bits: Sequence[int]) -> np.ndarray:
+        """Pack some values (N,), most significant first; those with a name between bounds of their chunk."""
+        word, bounds = np.zeros(count, np.uint32), []
+        for value, name, width in zip(values, names, bits):
+            if name:
+                table = value[rows]
+                low, high = table.min(1, keepdims=True), table.max(1, keepdims=True)
+                value = ((table - low) / np.where(high > low, high - low, 1)).reshape(-1)[:count]
+                bounds.append((name, low[:, 0], high[:, 0]))
+            top = (1 << width) - 1
+            word = word << width | np.rint(value * top).clip(0, top).astype(np.uint32)
+        chunk.update((f"min_{name}", low) for name, low, _ in bounds)
+        chunk.update((f"max_{name}", high) for name, _, high in bounds)
+        return word
+
+    places = [columns[axis] for axis in "xyz"]
+    scales = [columns[f"scale_{i}"].clip(-_SCALES, _SCALES) for i in range(3)]
+    colors = [np.float32(0.5) + np.float32(FLAT) * columns[f"f_dc_{i}"] for i in range(3)]
+    opacity = 1 / (1 + np.exp(-columns["opacity"].astype(np.float64)))
+    quaternions = np.stack([columns[f"rot_{i}"] for i in range(4)], -1).astype(np.float64)
+    quaternions /= np.linalg.norm(quaternions, axis=-1, keepdims=True)
+    largest = np.abs(quaternions).argmax(-1)
+    quaternions *= np.where(np.take_along_axis(quaternions, largest[:, None], -1) < 0, -1, 1)
+    others = np.array([[j for j in range(4) if j != i] for i in range(4)])[largest]  # (N, 3), ascending
+    parts = np.take_along_axis(quaternions, others, -1) * math.sqrt(0.5) + 0.5
+    vertex["packed_position"] = packed(places, ("x", "y", "z"), _BITS)
+    vertex["packed_rotation"] = packed([largest / 3, *parts.T], ("",) * 4, (2, 10, 10, 10))
+    vertex["packed_scale"] = packed(scales, ("scale_x", "scale_y", "scale_z"), _BITS)
+    vertex["packed_color"] = packed([*colors, opacity], ("r", "g", "b", ""), (8,) * 4)
+    elements = {"chunk": chunk, "vertex": vertex}
+    rest = {name: column for name, column in columns.items() if name.startswith("f_rest_")}
+    if rest:
+        steps = {name: np.floor((column / (2 * _HARMONICS) + 0.5) * 256) for name, column in rest.items()}
+        elements["sh"] = {name: step.clip(0, 255).astype(np.uint8) for name, step in steps.items()}
+    return elements
+
+
+def along_curve(points: np.ndarray) -> np.ndarray:
+    """Order points (N, 3) along a Z-order curve, so that what follows each other lies close: rows (N,)."""
+    low, size = points.min(0), max(float(np.ptp(points, 0).max()), 1e-30)
+    cells = ((points - low) / size * 1023).astype(np.uint64)
+    code = np.zeros(len(points), np.uint64)
+    for bit, axis in np.ndindex(10, 3):
+        code |= (cells[:, axis] >> np.uint64(bit) & np.uint64(1)) << np.uint64(3 * bit + axis)
+    return code.argsort(kind="stable")
+
+
+def header_comments(source: Source, rotation: Tensor) -> list[str]:
+    """Return what viewers read in a header: ``Vertical axis: z``, as nerfstudio and Brush write it, where the
+    images' mean upward direction, after a rotation (3, 3), is along an axis or against it; else nothing.
+    """
+    upwards = (rotation @ mean_up(list(source.cameras)).double()).abs()
+    return [f"Vertical axis: {'xyz'[int(upwards.argmax())]}"] if float(upwards.max()) > _ALONG else []
+
+
+def export_ply(
+    source: Source, folder: Path, progress: Progress, *, degree: int, up: str, compressed: bool
+) -> dict:
     """Write ``frames/frame_0000.ply`` and so on; of particles also ``canonical.ply`` and ``motion.npz``,
     which moves it.
 
@@ -84,37 +178,55 @@ def export_ply(source: Source, folder: Path, progress: Progress, *, degree: int,
         progress: called after each file.
         degree: of the spherical harmonics in a file, 0 to 3.
         up: see ``Source.rotation_to``; ``canonical.ply`` and ``motion.npz`` are not rotated.
+        compressed: write ``frames/frame_0000.compressed.ply`` alone, of the run's degree at most.
 
     Returns:
         the facts for ``about.json``.
+
+    Raises:
+        ValueError: for ``compressed`` without particles.
     """
-    (folder / "frames").mkdir()
     rotation, total = source.rotation_to(up), len(source.times)
-    files = [folder / "frames" / f"frame_{number:04d}.ply" for number in range(total)]
+    if compressed and not source.has_ellipsoids:
+        raise ValueError(
+            f"compressed: expected a run of particles, as it is a format of theirs, but got one of "
+            f"{source.model}; leave it out"
+        )
+    (folder / "frames").mkdir()
+    suffix = ".compressed.ply" if compressed else ".ply"
+    files = [folder / "frames" / f"frame_{number:04d}{suffix}" for number in range(total)]
+    comments = header_comments(source, rotation)
     if not source.has_ellipsoids:
         tracks = tracks_of(source, _ALL, progress)
         for file, places in zip(files, tracks.positions @ rotation.T.float()):
-            write_ply(file, point_columns(places, tracks.colors[0]))
+            write_ply(file, {"vertex": point_columns(places, tracks.colors[0])}, comments=comments)
         return {
             "points": len(tracks),
             "kind": "points of the surface",
             "colors": "sRGB, 8 bits, as in the images",
             "up": up,
         }
+    template = source.method.template()
+    own_degree = math.isqrt(template.harmonics.shape[1]) - 1
+    degree = min(degree, own_degree) if compressed else degree
+    order = along_curve(template.centers.cpu().numpy()) if compressed else slice(None)
     for number, (file, time) in enumerate(zip(files, source.times)):
         cloud = source.method.ellipsoids(time)
-        write_ply(file, splat_columns(cloud if up == "world" else cloud.turned(rotation), degree))
+        columns = splat_columns(cloud if up == "world" else cloud.turned(rotation), degree)
+        columns = {name: column[order] for name, column in columns.items()}
+        write_ply(file, packed_columns(columns) if compressed else {"vertex": columns}, comments=comments)
         progress(number + 1, total)
-    template = source.method.template()
-    write_ply(folder / "canonical.ply", splat_columns(template, degree))
-    motion = {name: value.cpu().numpy() for name, value in source.method.movement(source.times).items()}
-    np.savez(folder / "motion.npz", times=np.array(source.times, np.float32), **motion)
+    if not compressed:
+        comments = header_comments(source, source.rotation_to("world"))
+        write_ply(folder / "canonical.ply", {"vertex": splat_columns(template, degree)}, comments=comments)
+        motion = {name: value.cpu().numpy() for name, value in source.method.movement(source.times).items()}
+        np.savez(folder / "motion.npz", times=np.array(source.times, np.float32), **motion)
     return {
         "particles": len(template),
-        "kind": "Gaussian splats",
+        "kind": "Gaussian splats" + (", compressed" if compressed else ""),
         "up": up,
         "degree": degree,
-        "degree of the run": int(template.harmonics.shape[1] ** 0.5) - 1,
+        "degree of the run": own_degree,
         "colors": "sRGB, as in the images: 1/2 + 0.28209479177387814 f_dc is the mean over directions",
     }
 
@@ -250,7 +362,7 @@ def export_mesh(
         vertices, rgb, faces = isosurface(opacity, colors, lattice, level)
         vertices, path = vertices @ rotation.T, folder / f"mesh_{number:04d}.{files}"
         if files == "ply":
-            write_ply(path, point_columns(vertices, rgb), faces)
+            write_ply(path, {"vertex": point_columns(vertices, rgb)}, faces)
         else:
             with path.open("w") as file:  # colours behind the places, a common extension of OBJ
                 rows = np.concatenate([vertices.numpy(), rgb.numpy()], -1)
