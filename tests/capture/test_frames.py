@@ -57,6 +57,22 @@ def test_frames_are_turned_upright(tmp_path, rotation, size, bright):
     assert len(stamps_of(film)) == 3
 
 
+def test_frames_of_an_interlaced_film_are_whole(tmp_path):
+    """A bar that goes 8 pixels to the right between the two fields of a frame."""
+    frames = np.zeros((8, 96, 128, 3), np.uint8)
+    for n, frame in enumerate(frames):
+        for field in (0, 1):
+            left = 8 * (2 * n + field)
+            frame[field::2, left : left + 24] = 250
+    options = ["-flags", "+ilme+ildct", "-x264-params", "tff=1", "-field_order", "tt"]
+    film = write_film(tmp_path / "a.mp4", frames, options=options)
+    assert len(stamps_of(film)) == 8
+    (image,) = extracted(film, [3], None)
+    rows = image[..., 0].astype(int)
+    assert np.abs(np.diff(rows[8:-8], axis=0)).max() < 60
+    assert rows[40, 58:70].min() > 200
+
+
 def test_frames_are_made_smaller_never_larger_by_as_many_threads_as_given(tmp_path, monkeypatch):
     film = write_film(tmp_path / "a.mp4", numbered(2))
     calls, popen = [], subprocess.Popen

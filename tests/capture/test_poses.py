@@ -65,7 +65,9 @@ def test_cameras_without_a_picture_are_left_out(tmp_path):
     assert list(found.cameras) == list(theirs)
     assert found.absent == list(cameras)[:1]
     assert set(found.seen[:, 0]) == set(range(5))
-    with pytest.raises(ValueError, match="images: expected pictures as .*, as the model has, but got none"):
+    with pytest.raises(
+        ValueError, match="images: expected pictures as .*, as the model has, but got a.png; set"
+    ):
         read_model(tmp_path / "sparse", {"a.png": "a.png"})
 
 

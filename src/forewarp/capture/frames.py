@@ -50,6 +50,7 @@ _TRANSFER = re.compile(r"Video: .*\b(" + "|".join(_HDR) + r")\b")
 # The tags of a stream, and its size; a matrix of colours stands first in its tag.
 _TAGS = re.compile(r"Video: [^,]*, \w+(?:\(([^)]*)\))?, (\d+)x(\d+)")
 _MATRIX = re.compile(r"\b(?<!/)(bt|smpte|fcc|gbr|ycg|ictcp)")
+_INTERLACED = re.compile(r"Video: .*\b(top|bottom) (coded )?first\b")
 _SD = 1024, 576  # pixels of the longer and the shorter side, at most
 # 203 cd/m2 are the white of SDR (BT.2408); below 0.8 of it colours stay, above they are compressed.
 _TO_SDR = (
@@ -165,8 +166,10 @@ def _from_video(
     if source.masks is not None:
         assumed, bars = _told(bars, "stay, as masks= are of whole frames"), (0.0, 0.0)
     transfer = hdr_of(video)
-    mapped = f" ({_HDR[transfer]}, tone-mapped to SDR)" if transfer else ""
-    with step(f"taking frames{mapped}") as progress:
+    changed = [f"{_HDR[transfer]}, tone-mapped to SDR"] if transfer else []
+    changed += ["interlaced, made whole"] if _whole(video) else []
+    title = "taking frames" + (f" ({'; '.join(changed)})" if changed else "")
+    with step(title) as progress:
         for index, pixels in zip(chosen, extracted(video, chosen, size, threads, bars)):
             name = f"frame_{index + 1:06d}.jpg"
             write_image(folder / name, pixels)
@@ -483,7 +486,7 @@ def measure(video: Path, progress: Progress, threads: int | None = None) -> tupl
     sharp, widths, speeds, are_new, before, log = [], [], [], [], None, _Log()
     brightest = 0
     long, short = (f"if(gt({a},{b}),{_MEASURED},-1)" for a, b in (("iw", "ih"), ("ih", "iw")))
-    small = f"scale=w='min(iw,{long})':h='min(ih,{short})',format=gray"
+    small = f"{_whole(video)}scale=w='min(iw,{long})':h='min(ih,{short})',format=gray"
     for image in _decode(video, f"showinfo=checksum=0,{small}", "pgm", log, threads):
         sharp.append(sharpness(image))
         widths.append(edge_width(image))
@@ -524,7 +527,7 @@ def extracted(
         half = len(indices) // 2
         return f"({any_of(indices[:half])}+{any_of(indices[half:])})"
 
-    filters = f"select='{any_of(chosen)}',scale=w='iw*sar':h=ih"
+    filters = f"{_whole(video)}select='{any_of(chosen)}',scale=w='iw*sar':h=ih"
     if max(bars) > 0:
         filters += f",crop=w=iw*{1 - 2 * bars[0]}:h=ih*{1 - 2 * bars[1]}"
     if size is not None:
@@ -540,6 +543,11 @@ def hdr_of(video: Path) -> str | None:
     """Return ffmpeg's name of the transfer of an HDR video, HLG or PQ; None: it is SDR."""
     match = _TRANSFER.search(_header(video))
     return match and match[1]
+
+
+def _whole(video: Path) -> str:
+    """Return the filter that makes whole frames of an interlaced video, with its comma; else nothing."""
+    return "bwdif=mode=send_frame:deint=interlaced," if _INTERLACED.search(_header(video)) else ""
 
 
 def _is_untagged_hd(video: Path) -> bool:

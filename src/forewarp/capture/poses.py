@@ -169,8 +169,10 @@ def read_model(folder: Path, originals: Mapping[str, str] | None = None) -> Reco
         ours = {original: name for name, original in originals.items()}
         absent = sorted({image.name for image in model.images.values() if image.has_pose} - ours.keys())
         if len(absent) == sum(image.has_pose for image in model.images.values()):
+            got = min(ours, default="none")
             raise ValueError(
-                f"images: expected pictures as {absent[0]}, as the model has, but got none; set images="
+                f"images: expected pictures as {absent[0]}, as the model has, but got {got}; set images= to "
+                "the folder where its names begin, or rename them"
             )
         for image in model.images.values():
             image.name = ours.get(image.name, image.name)
