@@ -56,6 +56,7 @@ def rows_of(*chosen):
     return [[word for word in row if word is not None] for row in zip_longest(*columns)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("words", rows_of("capture", "logger", "trainer"), ids=" ".join)
 def test_options_of_every_method_compose_and_instantiate(words):
     assert [stage.settings.name for stage in run_of(*words).stages] == ["coarse", "fine"]
@@ -181,6 +182,7 @@ def test_each_number_of_a_method_is_taken_where_it_is_keyed(model):
     assert composed("scene=specimen_band", f"model={model}").stage.fine.num_voxels == [[0, 15625]]
 
 
+@pytest.mark.slow
 def test_effects_follow_the_images_and_the_command_line_wins():
     def chosen(*words):
         choices = composed("data.scene=x", "model=forward", *words, hydra=True).hydra.runtime.choices

@@ -251,6 +251,7 @@ FAULTS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("model", FAULTS)
 def test_faults_of_the_released_code_are_on_in_faithful_and_off_in_fast(model):
     for preset, kept in (("faithful", FAULTS[model]), ("fast", [])):
@@ -335,6 +336,7 @@ ON_CAPTURES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dataset", ["dnerf", "hypernerf", "nhr", "lego_complete"])
 def test_the_papers_method_has_its_printed_numbers(dataset):
     config = composed("model=forward", f"experiment={dataset}", "data.scene=x", "preset=faithful")
@@ -352,6 +354,7 @@ def test_the_papers_method_has_its_printed_numbers(dataset):
     assert captured == (field.features is not None and field.features.grid.shape == (lattice.count, 12))
 
 
+@pytest.mark.slow
 def test_the_papers_method_names_what_it_does_otherwise():
     def of(*words, stage="fine"):
         words = ("model=forward", "experiment=dnerf", "data.scene=hook", "preset.inpainter_width=16", *words)

@@ -56,6 +56,7 @@ def test_no_sweep_is_forgotten():
     assert {path.stem for path in (ROOT / "sweeps").glob("*.yaml")} == PAPER.keys() | OTHERS
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("sweep", "count"), PAPER.items())
 def test_a_sweep_has_its_jobs(sweep, count):
     jobs = jobs_of(sweep)
@@ -72,6 +73,7 @@ def test_every_scene_and_choice_composes_and_has_a_folder_of_its_own(sweep):
     assert len({hashed(job_of(sweep, *job)).run for job in jobs}) == len(jobs)
 
 
+@pytest.mark.slow
 def test_effects_are_compared_on_every_specimen():
     jobs = jobs_of("effects")
     assert len(jobs) == 18
@@ -93,6 +95,7 @@ def test_seeds_repeat_every_job():
     assert len(thrice) == 3 * len(once)
 
 
+@pytest.mark.slow
 def test_a_typed_scene_takes_the_place_of_those_of_a_sweep(ok, in_tmp):
     words = ["sweeps=minutes", "paths.scenes=nowhere", "score=null"]
     for typed, scenes in (
@@ -141,6 +144,7 @@ def test_a_job_is_named_by_what_was_typed_but_not_by_how_it_runs(forewarp, in_tm
     assert yaml.safe_load(forewarp("train", *words).out)["variant"] == {"name": " ".join(typed)}
 
 
+@pytest.mark.slow
 def test_an_ablation_takes_one_thing_from_all():
     def ablated(name):
         return composed(*HOOK, "preset=fast", f"ablation={name}")
@@ -158,6 +162,7 @@ def test_an_ablation_takes_one_thing_from_all():
     assert ablated("canonical_middle").data.canonical == "middle"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("preset", "tv_flow"), [("demo", 2.1e-4), ("fast", 1e-3), ("faithful", 1e-3)])
 def test_the_whole_method_has_the_papers_weights_and_networks_in_the_fine_stage(preset, tv_flow):
     config = composed(*HOOK, f"preset={preset}", "ablation=full")
@@ -176,6 +181,7 @@ def folder_of(config, **changes):
     return hashed(config).run
 
 
+@pytest.mark.slow
 def test_a_job_is_known_by_what_it_computes():
     job, other = (
         composed(f"sweeps=ablation_{sweep}", *HOOK, "ablation=full") for sweep in ("losses", "modules")
@@ -203,6 +209,7 @@ def test_what_stands_alone_begins_as_the_coarse_stage_would():
     assert alone.fine.lr == {**full.fine.lr, "flow": full.coarse.lr.flow}
 
 
+@pytest.mark.slow
 def test_jobs_of_minutes_have_folders_of_their_own():
     assert sorted(job[-1] for job in jobs_of("minutes"))[-2:] == [
         "data.scene=moving-hand",

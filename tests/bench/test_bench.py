@@ -35,6 +35,7 @@ def taken(dense, threshold=0.0):
 
 
 # The one saving that is not exact: no colour for samples of less weight than 1e-4.
+@pytest.mark.slow
 @pytest.mark.parametrize(("threshold", "most"), [(0.0, 1e-4), (1e-4, 5e-4)])
 def test_a_step_on_what_is_occupied_draws_what_the_dense_one_draws(threshold, most):
     images, step, _, radiance = taken(False, threshold)
@@ -47,6 +48,7 @@ def test_a_step_on_what_is_occupied_draws_what_the_dense_one_draws(threshold, mo
         torch.testing.assert_close(images[name], image, atol=most, rtol=0)
 
 
+@pytest.mark.slow
 def test_a_step_on_what_is_occupied_learns_what_the_dense_one_learns():
     inside, everywhere = taken(False)[2], taken(True)[2]
     present = inside.abs().amax(-1) > 0
@@ -136,6 +138,7 @@ def test_a_start_is_timed_by_its_parts(tmp_path):
     assert sum(s for name, s in spent.items() if name != start_up.WHOLE) <= spent[start_up.WHOLE] + 0.1
 
 
+@pytest.mark.slow
 def test_a_step_with_published_numbers_is_counted_and_timed(fitted):
     scene = fitted.parent / "scenes" / "vehicle"
     step = measured("tnerf", scene, 4)
@@ -165,6 +168,7 @@ NOISE = torch.rand(40, 48, 3, generator=torch.Generator().manual_seed(0))
 DISC = (torch.arange(40)[:, None] - 20) ** 2 + (torch.arange(48)[None] - 20) ** 2 < 100
 
 
+@pytest.mark.slow
 def test_limits_of_a_run_are_a_row(fitted, capsys, monkeypatch):
     rows = []
     monkeypatch.setattr("tests.bench.limits.limits_of", lambda run: rows.append(limits_of(run, 2)) or rows[0])

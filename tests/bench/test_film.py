@@ -22,6 +22,7 @@ def made(tmp_path_factory):
     return folder
 
 
+@pytest.mark.slow
 def test_the_film_stands_upright_and_is_what_truth_holds(made):
     frames = read_film(made / "film.mp4", 64, 36)  # turned by its flag
     scene = read_scene(made, "truth", normalise=False)
@@ -37,6 +38,7 @@ def test_the_film_stands_upright_and_is_what_truth_holds(made):
     assert len(scene.still) > 1000
 
 
+@pytest.mark.slow
 def test_the_shutter_smears_what_moves_and_only_that_counts_as_moving(made):
     filming = film.Filming(replace(film.PHONE, size=TINY.size))
     blurred, moving = filming.take(0.5)

@@ -108,6 +108,7 @@ def turned(count):
     return np.stack(frames)
 
 
+@pytest.mark.slow
 def test_a_camera_that_turns_is_refused(refused, in_tmp):
     write_film(in_tmp / "a.mp4", turned(6))
     said = refused("capture", "video=a.mp4", "out=new/hand", "threads=1", "features=400")
@@ -136,6 +137,7 @@ def test_a_camera_that_stands_is_refused_also_by_images_with_spaces_and_alpha(re
     assert "camera: expected one that moves, but got matches that shift by 0." in said
 
 
+@pytest.mark.slow
 def test_poses_that_are_known_become_a_scene(ok, refused, in_tmp):
     cameras = cameras_on_arc(8)
     write_images(in_tmp / "pictures", cameras)

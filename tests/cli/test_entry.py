@@ -108,6 +108,7 @@ def test_an_option_that_not_every_job_has_is_named(refused, in_tmp):
     assert expected in refused("train", *jobs, "paths.data=data")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("arguments", "model", "owner"),
     [
@@ -206,6 +207,7 @@ def test_one_line(error, line):
     assert one_line(error).startswith(line)
 
 
+@pytest.mark.slow
 def test_a_failed_job_of_several_does_not_stop_the_others(forewarp, monkeypatch, in_tmp):
     seen = []
 

@@ -128,6 +128,7 @@ def balls(originals, in_tmp):
     return shutil.copytree(originals / "balls", in_tmp / "run")
 
 
+@pytest.mark.slow
 def test_what_is_typed_trains_and_trains_again_without_trust(ok, found, sheen):
     config = yaml.safe_load((sheen / "config.yaml").read_text())
     assert config["data"]["_target_"] == "mine.data.MineDataModule"
@@ -162,6 +163,7 @@ def test_an_interrupted_run_goes_on(forewarp, ok, refused, found, in_tmp):
     assert json.loads((in_tmp / "run" / "coarse" / "done.json").read_text())["steps"] == 6
 
 
+@pytest.mark.slow
 def test_a_stored_run_is_measured_by_who_trusts_it(ok, refused, sheen, monkeypatch):
     line = refused("evaluate", "run=run")
     assert line.startswith(
@@ -175,6 +177,7 @@ def test_a_stored_run_is_measured_by_who_trusts_it(ok, refused, sheen, monkeypat
     ok("evaluate", "run=run")
 
 
+@pytest.mark.slow
 def test_the_page_of_a_run_takes_trust(ok, sheen, monkeypatch):
     monkeypatch.setattr("forewarp.cli.report.write_film", lambda *_: None)
     page = ["report", "kind=run", "run=run"]
@@ -204,6 +207,7 @@ def test_the_environment_goes_along_whatever_a_launcher_hands_on(ok, sheen, monk
     ok("evaluate", "run=run")
 
 
+@pytest.mark.slow
 def test_a_method_is_measured_rendered_and_opened_with_trust(ok, refused, balls):
     still = ["format=png", "frames=2", "size=16", "threads=1"]
     for words in (["evaluate", "run=run"], ["render", "run=run", *still]):

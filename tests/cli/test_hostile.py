@@ -87,6 +87,7 @@ ATTACKS = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("kind", "name"), ATTACKS)
 def test_nothing_outside_is_written(kind, name, fitted, outside, forewarp):
     make, named, _ = KINDS[kind]
@@ -124,6 +125,7 @@ def test_a_file_is_not_written_through_a_link_that_lies_in_wait(in_tmp, monkeypa
     assert Path("secret").read_text() == SECRET
 
 
+@pytest.mark.slow
 def test_a_helper_process_imports_nothing_of_the_current_folder(in_tmp, monkeypatch):
     from forewarp.methods.particles import start
 

@@ -15,6 +15,7 @@ def run(fitted, tmp_path_factory):
     return shutil.copytree(fitted, tmp_path_factory.mktemp("runs") / "vehicle")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("path", ["orbit", "both"])
 def test_a_film_of_each_path(forewarp, run, path):
     done = forewarp("render", f"run={run}", f"path={path}", "frames=5", "size=32")
@@ -37,6 +38,7 @@ def test_trajectories_are_drawn_over_fixed(ok, run):
     assert (abs(plain - drawn).max(-1) > 20).sum() > 20
 
 
+@pytest.mark.slow
 def test_a_gif_of_small_images_is_larger_and_large_images_keep_their_size(ok, run, monkeypatch):
     for least, side in ((render.LEAST_SIZE, 400), (16, SIZE)):
         monkeypatch.setattr(render, "LEAST_SIZE", least)

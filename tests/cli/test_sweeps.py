@@ -23,6 +23,7 @@ def write(folder, size=16, frames=6, **views):
     synthesize(folder, size=size, frames=frames, samples_per_pixel=1, **{"test_views": (1, 1, 0)} | views)
 
 
+@pytest.mark.slow
 def test_absent_scenes_of_a_sweep_are_named_and_do_not_count_as_failed(ok, in_tmp):
     scenes = "hydra.sweeper.scenes=['experiment=dnerf data.scene=hook']"
     done = ok("train", "--multirun", "sweeps=dnerf", "model=particles", scenes, "paths.scenes=nowhere")

@@ -30,6 +30,7 @@ def test_writes_a_scene_that_reads(forewarp, in_tmp):
     assert [path.name for path in in_tmp.joinpath("a").iterdir()] == ["s"]
 
 
+@pytest.mark.slow
 def test_keeps_a_scene_unless_told_otherwise(forewarp, ok, refused, in_tmp):
     forewarp("synthesize", "folder=s", *SMALL)
     assert "s: expected a new or empty folder" in refused("synthesize", "folder=s", *SMALL, "seed=1")
@@ -81,6 +82,7 @@ def test_a_folder_of_something_else_is_left_alone(tmp_path):
     assert (tmp_path / "s" / "thesis.txt").read_text() == "dear"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [name for name in options("data") if name.startswith("synthetic")])
 def test_synthetic_data_names_arguments_of_its_writer(name, tmp_path):
     data = instantiate(composed(f"data={name}", f"data.root={tmp_path}").data, _convert_="all")
@@ -118,6 +120,7 @@ def test_every_dataset_is_written_whole_and_replaced_when_told(
 LEGO = {"size": 8, "frames": 2, "motions": ["lift", "drive"], "test_views": [1, 2, 1], "val_views": 0}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "scene", "synthesis", "counts"),
     [

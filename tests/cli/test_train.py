@@ -99,6 +99,7 @@ def test_metrics_have_the_promised_shape(fitted):
     assert {"device", "threads", "versions", "background", "resolution"} <= set(content["protocol"])
 
 
+@pytest.mark.slow
 def test_evaluating_again_gives_the_same_numbers_or_others(ok, fitted, copied, scenes, tmp_path):
     moved = shutil.copytree(scenes, tmp_path / "moved")
     done = ok("evaluate", f"run={copied}", f"data.root={moved}")
@@ -130,6 +131,7 @@ def test_a_begun_run_is_finished_and_measured_and_what_does_not_matter_may_chang
     assert yaml.safe_load((begun / "config.yaml").read_text())["checkpoint_seconds"] == 5
 
 
+@pytest.mark.slow
 def test_a_run_is_resumed_by_its_folder_with_what_may_change(ok, refused, begun):
     before = yaml.safe_load((begun / "config.yaml").read_text())
     ok("train", f"resume={begun}", "threads=2", "sentinel.skip=3", "trainer=cpu", "evaluate=false")
@@ -168,6 +170,7 @@ def test_a_folder_in_work_is_refused(refused, copied):
             assert "nobody works on" in refused(name, str(copied))
 
 
+@pytest.mark.slow
 def test_a_run_with_views_set_aside_leaves_its_curve(ok, scenes, tmp_path):
     run = tmp_path / "run"
     done = ok(*arguments(scenes, run, *SHORT, "data.held_out=2", "callbacks.accuracy.first=0.001"))
@@ -176,6 +179,7 @@ def test_a_run_with_views_set_aside_leaves_its_curve(ok, scenes, tmp_path):
     assert f"fitted: {run}; measure it with forewarp-evaluate run={run}\n" in done.out
 
 
+@pytest.mark.slow
 def test_renderings_of_an_inpainter_are_both_scored(ok, scenes, tmp_path):
     more = ["model/inpainter=unet3d", "model/upsampler=trilinear", "budget.iterations=2"]
     ok(*arguments(scenes, tmp_path / "run", *SHORT, *more, "evaluate=true", "sheets=0", "views=2"))
@@ -225,6 +229,7 @@ def test_a_broken_step_ends_in_one_line_and_is_stored(refused, scenes, in_tmp):
     assert stored["found"] == "parameter: radiance.color"
 
 
+@pytest.mark.slow
 def test_skipped_steps_are_told(ok, scenes, in_tmp, monkeypatch):
     from forewarp.data.batches import Sampler
 
@@ -259,6 +264,7 @@ def test_particles_begin_where_voxels_found_matter(ok, refused, scenes, in_tmp, 
     assert "model/radiance: expected an option of model=particles" in line  # of the run as ever
 
 
+@pytest.mark.slow
 def test_paths_and_names_are_taken_as_typed(fitted, in_tmp, ok):
     root, name = in_tmp / "josé + familie", "Größe [2], it's (1)"
     shutil.copytree(fitted.parent / "scenes" / "vehicle", root / name)

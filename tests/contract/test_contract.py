@@ -63,6 +63,7 @@ def test_it_builds(name, dataset, scenes):
     assert any(bool(g.any()) for g in gradients.values())
 
 
+@pytest.mark.slow
 @on(DATASETS)
 def test_its_loss_falls(name, dataset, fitted):
     losses = fitted(name, dataset).losses
@@ -71,6 +72,7 @@ def test_its_loss_falls(name, dataset, fitted):
     assert last < METHODS[name].falls * first
 
 
+@pytest.mark.slow
 @on(DATASETS)
 def test_a_checkpoint_gives_the_same_pictures(name, dataset, fitted):
     found = fitted(name, dataset)
@@ -143,6 +145,7 @@ def test_every_parameter_has_one_rate(name, scenes):
     assert sum(len(g["params"]) for g in module.configure_optimizers().param_groups) == len(grouped)
 
 
+@pytest.mark.slow
 @each
 def test_a_term_of_weight_zero_is_never_called(name, scenes):
     data, entry = data_of("dnerf", scenes), METHODS[name]
@@ -162,6 +165,7 @@ def full_model(entry):
     return partial(entry.model, **{k: v for e in entry.effects.values() for k, v in e.on.items()})
 
 
+@pytest.mark.slow
 @each_effect
 def test_an_effect_that_is_off_is_absent_and_one_that_is_on_is_called(name, effect, scenes, monkeypatch):
     entry, data = METHODS[name], data_of("dnerf", scenes)
@@ -206,6 +210,7 @@ def test_two_runs_of_one_seed_are_equal(name, straight, scenes, tmp_path):
     assert straight(name).last == again.last
 
 
+@pytest.mark.slow
 @each
 def test_a_run_that_was_stopped_continues_exactly(name, straight, scenes, tmp_path):
     stages = [stage_of(METHODS[name], steps=STEPS)]
@@ -244,6 +249,7 @@ def test_a_run_that_was_killed_continues_exactly(name, straight, scenes, tmp_pat
     assert whole.last == again.last
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("place", ["after", "before"])
 @each
 def test_it_works_beside_a_voxel_stage(name, place, scenes, tmp_path):

@@ -10,6 +10,7 @@ from tests.contract.table import METHODS
 from tests.support.elsewhere import GPU, Elsewhere
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", METHODS)
 def test_steps_and_a_picture_stay_on_their_device(scenes, name):
     data = data_of("dnerf", scenes)

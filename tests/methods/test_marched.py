@@ -249,6 +249,7 @@ def test_each_view_of_a_batch_is_seen_by_the_code_of_its_camera():
     assert not first.allclose(second)
 
 
+@pytest.mark.slow
 def test_the_second_stage_of_ndvg_goes_on_where_the_first_ended():
     first = method("ndvg", 13**3, marching=JITTER, numbers={"view_dependence": False, "box_alpha": 0.05})
 

@@ -128,6 +128,7 @@ def released_deviation(layer, gain):
     return gain * (2 / (sum(layer.weight.shape[:2]) * size)) ** 0.5
 
 
+@pytest.mark.slow
 def test_first_values_are_the_released_ones():
     torch.manual_seed(0)
     leaky = (2 / 1.04) ** 0.5
@@ -307,6 +308,7 @@ def fitted(tmp_path, scene, steps):
     return sum(psnr) / len(psnr)
 
 
+@pytest.mark.slow
 def test_one_view_is_learned_beyond_the_background_alone(tmp_path):
     scene = replace(moving_scene(), train=moving_scene().train[:1])
     truth = scene.train[0].load().double() / 255

@@ -49,6 +49,7 @@ def test_ssim_is_torchmetrics_in_float64():
     assert ssim(a, b) == pytest.approx(theirs, abs=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("legacy", [False, True])
 def test_ms_ssim_is_its_twin(legacy):
     # Gray: the right one's channels are all alike, so its twin walks through one of them.

@@ -42,6 +42,7 @@ def words(scenes, in_tmp):
     return [*VOXELS, *TINY, f"data.root={scenes}", "data.scene=vehicle"]
 
 
+@pytest.mark.slow
 def test_a_plan_is_made_once_told_and_fitted(forewarp, ok, words, monkeypatch, in_tmp):
     kept = SceneDataModule.targets
 
@@ -181,6 +182,7 @@ def test_auto_plans_and_fits_in_one_go_a_scene_of_one_time_without_motion(
     assert "fine: finished before" in forewarp("train", *typed, "effects=auto").out
 
 
+@pytest.mark.slow
 def test_mistakes_are_one_line(refused, words, in_tmp):
     assert "use model=particles or model=forward" in refused("plan", *words, "model=backward")
     assert refused("plan", *words, "~stage.fine").startswith("stage: expected a coarse stage and another")

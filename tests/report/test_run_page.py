@@ -188,6 +188,7 @@ def test_an_effect_names_what_was_typed_and_an_option_that_says_something(tmp_pa
     ] == [True] * 3
 
 
+@pytest.mark.slow
 def test_pictures_and_video_are_made_smaller_until_the_page_fits(tmp_path):
     folder = told_run(tmp_path)
     film = write_video(tmp_path / "film.mp4", (noise(128, i) for i in range(12)), fps=10)
@@ -340,6 +341,7 @@ def test_the_command_renders_the_telling_views(ok, run, tmp_path):
     assert "voxels" in page.text
 
 
+@pytest.mark.slow
 def test_a_run_without_rendering_data_or_its_end_still_has_a_page(ok, run, tmp_path):
     folder = shutil.copytree(run, tmp_path / "run")
     done = ok("report", "kind=run", f"run={folder}", f"data.root={tmp_path}/moved")
@@ -365,6 +367,7 @@ def test_a_run_without_rendering_data_or_its_end_still_has_a_page(ok, run, tmp_p
     assert "prediction, in training: stage fine at 100 %" in page.of("alt")
 
 
+@pytest.mark.slow
 def test_a_missing_video_is_made_as_forewarp_render_does(ok, run, tmp_path, monkeypatch):
     asked = []
 

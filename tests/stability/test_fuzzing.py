@@ -330,6 +330,7 @@ def put(changes):
             path.write_bytes(content)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [*FORMATS, "config", "checkpoint"])
 def test_harmed_files_are_read_or_refused_in_one_line(loaders, bounded, name):
     loader, outcomes = loaders[name], Counter()

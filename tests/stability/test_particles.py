@@ -163,6 +163,7 @@ def along(loss, value, direction):
     return (sides[0] - sides[1]) / (2 * STEP)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("degree", "lens"), [(2, {}), (3, LENS)])
 def test_splats_by_what_moves_nothing(degree, lens):
     particles, warp, *bases = crowd(count=3, degree=degree)
@@ -216,6 +217,7 @@ def exactly(options, lens, monkeypatch):
     return method, next(iter(data.train_dataloader())), module.generator
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", METHODS)
 def test_a_step_of_the_method(name, monkeypatch):
     """The loss is that of the step itself, all terms weighted; everything is the plain reference.

@@ -120,6 +120,7 @@ def test_bad_beginnings_train(tmp_path, monkeypatch, name):
     check_sound(module, losses, SCENE, 8)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("factor", "has_alpha"), [(1e-3, True), (2.0**14, False)])
 def test_no_number_depends_on_the_unit_of_length(tmp_path, factor, has_alpha):
     """With all effects and terms on, the first steps are equal except for rounding.
@@ -170,6 +171,7 @@ def enlarged(scene, factor):
     return replace(scene, train=tuple(map(grown, scene.train)))
 
 
+@pytest.mark.slow
 def test_images_of_two_sizes_say_the_same():
     """The photo term, and the gradients of all terms together, of the same particles.
 
@@ -226,6 +228,7 @@ def random_nodes(points, count, curve, **options):
     return nodes
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["spline", "cosines"])
 @pytest.mark.parametrize("time", [0.0, 1e-12, 1e-7, 1 - 1e-7, 1.0])
 def test_at_and_beside_the_canonical_time_and_the_ends(kind, time):

@@ -53,6 +53,7 @@ def test_bad_arguments_get_one_line(tmp_path, dataset, change, text):
 FILES = {"dnerf": 2 + 1 + 2 * 3 + 5 + 1, "hypernerf": 3 * 6 + 5}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dataset", FILES)
 def test_equal_arguments_give_equal_bytes(tmp_path, monkeypatch, dataset):
     monkeypatch.setattr(scenes, "POINTS", 200)
@@ -103,6 +104,7 @@ def test_the_default_counts_of_lego_complete_are_the_published_ones(monkeypatch,
         assert {v.time for v in views["train"]} <= {v.time for v in views["test"] if v.ability == "time"}
 
 
+@pytest.mark.slow
 def test_every_motion_is_a_scene_of_three_kinds_of_view_whose_depth_true_points_meet(tmp_path):
     few = {"frames": 3, "motions": ["lift", "drive"], "test_views": (1, 4, 1), "val_views": 1}
     synthesize_lego_complete(tmp_path, size=64, samples_per_pixel=1, **few)
@@ -222,6 +224,7 @@ def test_still_points_lie_on_what_never_moves(rig):
         assert ((pixel > 0) & (pixel < torch.tensor([SIDE, SIDE * 3 // 4]))).all()
 
 
+@pytest.mark.slow
 def test_what_the_dome_sees_is_where_its_points_and_clouds_are(tmp_path):
     scenes.synthesize_nhr(tmp_path / "scene", size=96, frames=2, points=300, samples_per_pixel=1)
     scene, world = nhr.read_scene(tmp_path, "scene", half_resolution=False), World("lift_tilt")

@@ -108,6 +108,7 @@ def test_without_validation_views_there_is_no_validation_curve(tmp_path):
     assert "val/psnr" not in tags["scalars"]
 
 
+@pytest.mark.slow
 def test_an_interrupted_watched_run_ends_as_an_unwatched_one(tmp_path, tmp_path_factory, capsys):
     with pytest.raises(SystemExit):
         watched_run(tmp_path, *all_watchers(), Interrupt("coarse", 4)).fit()

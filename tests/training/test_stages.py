@@ -200,6 +200,7 @@ def test_every_stage_counts_its_own_memory(tmp_path, monkeypatch):
     assert ours.finished()["fine"]["peak_memory_bytes"] == 7
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("choices", [{"motion": None, "trajectory": None}, EVERYTHING], ids=["static", "all"])
 def test_the_least_and_the_whole_model_train_carry_and_load(tmp_path, choices):
     data, model = ball_data(rays=64, size=16), forward_model(**choices)

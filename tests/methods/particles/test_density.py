@@ -68,6 +68,7 @@ def test_what_has_faded_is_too_large_or_stood_too_near_to_a_camera_goes():
     assert len(method.means) == 8  # all that there is does not vanish
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("last", "left"), [(1.0, 9), (0.5, 10)])
 def test_what_is_never_seen_goes_after_some_rounds_once_all_times_are_in_play(last, left):
     method, optimizer = few(motion="spline")
@@ -107,6 +108,7 @@ def test_opacity_counts_where_it_is_largest_and_is_bounded_there():
     assert len(method.means) == 3  # what appears later is not thrown away
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("share", [0.0, 1e-3, 0.2])
 def test_a_step_takes_opacity_of_what_its_image_shows_as_the_rate_falls(share):
     module = module_with(DATA, numbers={"opacity_decay": share, "crowd_decay": 0.0, "density_until": 0.0})

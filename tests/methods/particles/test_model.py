@@ -48,6 +48,7 @@ def test_gradients_are_those_of_autograd(options):
         assert error < 2e-3, name
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("factors", [{"photo": 1.0}, {"photo": 1.0, "dssim": 0.2}])
 def test_pixels_that_do_not_count_change_nothing(factors):
     DATA.asks = Particles.asks
@@ -93,6 +94,7 @@ def test_two_views_of_a_time_count_as_one_step():
     torch.testing.assert_close(one.gradients["means"], two.gradients["means"], rtol=1e-3, atol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("effect", [None, *EVERY])
 def test_an_effect_that_is_off_is_absent_and_the_others_are_there(effect):
     module = module_with(DATA, **(BARE if effect is None else EVERY | {effect: None}))
@@ -108,6 +110,7 @@ def test_an_effect_that_is_off_is_absent_and_the_others_are_there(effect):
         assert not any(name.startswith(("skinning.", "nodes.")) for name in module.method.state_dict())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("options", "counts"), [(BARE, (1, 1, 1, 0, 1)), (EVERY, (6, 3, 6, 2, 3))])
 def test_operators_get_nothing_of_what_is_off(monkeypatch, options, counts):
     seen, compare = [], model.compare
@@ -161,6 +164,7 @@ def test_particles_grow_to_what_the_images_call_for():
     assert int(Particles(start).final_count) == pytest.approx(2 * int(method.final_count), abs=1)
 
 
+@pytest.mark.slow
 def test_a_stage_and_its_queries_stay_on_their_device():
     options = EVERY | {"background": 10.0}
     numbers = {"density_interval": 0.1, "relink": 1, "density": 400.0, "density_until": 1.0, "rest_from": 0.3}
@@ -256,6 +260,7 @@ def test_without_numba_a_run_is_refused_before_anything_is_computed(tmp_path, mo
         run_of([stage_of(METHODS["particles"])], large, tmp_path).fit()
 
 
+@pytest.mark.slow
 def test_without_numba_particles_learn_the_same(tmp_path):
     pytest.importorskip("numba")
     found = {}

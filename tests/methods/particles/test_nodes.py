@@ -114,6 +114,7 @@ def test_times_are_off_by_what_was_learned_and_no_more():
     assert offsets(1.0) == pytest.approx(1.2)  # never by more than a fifth of all time
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("options", "times", "learned"),
     [
@@ -162,6 +163,7 @@ def test_gradients_by_the_offsets_are_finite_differences(rotates, time):
     assert "nodes.time_offsets.values" not in gradients()
 
 
+@pytest.mark.slow
 @torch.no_grad()
 def test_a_first_image_that_shows_the_second_time_is_understood():
     times, speed = [i / 20 for i in range(21)], torch.tensor([2.0, 1.0, 0.5])

@@ -15,6 +15,7 @@ from tests.support.particles import EVERY, module_with, shaken, small_data
 DATA = small_data()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "options", [EVERY | {"view_dependence": 2}, {"motion": None}], ids=["every", "still"]
 )
@@ -35,6 +36,7 @@ def test_ellipsoids_are_seen_as_the_particles_are(options, time, by):
     assert int((found[:, 5] > 0).sum()) > 50
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("motion", ["spline", "cosines"])
 def test_points_go_with_the_particles_beside_them(motion):
     method, generator = module_with(DATA, motion=motion).method, torch.Generator().manual_seed(0)
@@ -75,6 +77,7 @@ def pulled(pixels, where=lambda points: points[:, 0] > 0):
     return method, moves[method.skinning.links[:, 0].long()]
 
 
+@pytest.mark.slow
 def test_what_moves_is_seen_to_move_and_what_rests_is_not():
     method, moves = pulled(6.0)
     assert isinstance(method, HasLayers)

@@ -103,6 +103,7 @@ def test_only_an_error_linear_in_direction_is_explained_by_direction():
     assert explained_by_direction(where * float("nan"), towards, where, images, 0.05) == 0  # met nowhere
 
 
+@pytest.mark.slow
 def test_of_a_fitted_ball(tmp_path):
     data = ball_data()
     run = make_run(tmp_path, [stage(iterations=60)], data=data, model=forward_model(view_dependence=None))
