@@ -19,7 +19,7 @@ help: ## show this list
 install: ## create .venv with forewarp and all extras except the launchers of sweeps
 	test -x $(BIN)/python || $(PYTHON) -m venv .venv
 	$(BIN)/pip install --quiet uv
-	$(ADD) '.[cpu,synth,plots,viewer,export,capture,dev]'
+	$(ADD) '.[cpu,synth,plots,viewer,export,usd,capture,dev]'
 install-launchers: ## add joblib, Ray and submitit for sweeps (launcher=...), and Optuna (sweeps=search)
 	$(ADD) '.[sweeps]'
 install-browser: ## add a headless Chromium and playwright, which test the viewer's page; as root, on Debian

@@ -8,6 +8,7 @@ What one types most:
   run=FOLDER                    the run (needed)
   format=ply                    particles for viewers of Gaussian splats, a file a time; voxels as points
   format=glb                    particles with all of their motion, one small file (docs/format.md)
+  format=usd                    particles with time samples, for programs of OpenUSD 26.03 and later
   format=mesh                   the surface with colours, by marching cubes, a file a time
   format=gltf                   moving points as an animation, one file
   format=html                   one page for a browser, without a server, with a time slider
@@ -15,14 +16,14 @@ What one types most:
   times=N times=[0,0.5]         how many, evenly spaced, or which; not of glb, which holds all
   layer=moving|resting          only the particles that move, or those that rest
   out=FOLDER                    another folder
-  degree=0|1|2|3                ply: how finely colours depend on direction
+  degree=0|1|2|3                ply, usd: how finely colours depend on direction
   compressed=true               ply: about a tenth of the bytes, for SuperSplat, Spark, Babylon and others
-  up=world|y|-y|z               ply, mesh: which axis points upwards; -y for SuperSplat
+  up=world|y|-y|z               ply, usd, mesh: which axis points upwards; -y for SuperSplat
   resolution=N level=SHARE      mesh: points of the lattice along the longest side; opacity of the surface
   files=ply|obj                 mesh: the files
   points=N                      gltf, npz, html of voxels: most points
   quality=compact|lossless      glb: rounded to what an eye can tell, or in float32
-  seconds=N                     glb, gltf, html: how long the animation lasts
+  seconds=N                     glb, usd, gltf, html: how long the animation lasts
   megabytes=N                   html: most of the page; what does not fit is left out, and said
   views=N                       npz: cameras that tell which points are visible
   trust=[PACKAGE]               code of other packages that the run's config may name

@@ -33,6 +33,7 @@ class Format(NamedTuple):
 FORMATS = {
     "ply": Format("ply", ("degree", "up", "compressed")),
     "glb": Format("glb", ("quality", "seconds"), times=False),
+    "usd": Format("usd", ("degree", "up", "seconds"), "pxr", "usd"),
     "mesh": Format("ply", ("resolution", "level", "files", "up"), "skimage", "export"),
     "gltf": Format("tracks", ("points", "seconds")),
     "html": Format("html", ("points", "seconds", "megabytes"), "viser", "viewer"),
@@ -105,7 +106,7 @@ def write(
     require(kind)
     export = getattr(import_module(f"forewarp.export.{FORMATS[kind].module}"), f"export_{kind}")
     with folder_written_whole(folder, ABOUT) as part:
-        if kind not in ("mesh", "glb"):  # which ask for matter alone, and for particles
+        if kind not in ("mesh", "glb", "usd"):  # which ask for matter alone, and for particles
             source.check_tracks(kind)
         facts = export(source, part, progress, **options)
         files = sorted(file for file in part.rglob("*") if file.is_file())

@@ -1,0 +1,149 @@
+"""``format=usd``: particles as a ``ParticleField3DGaussianSplat`` of OpenUSD 26.03, with time samples."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from forewarp.export.tracks import Progress, Source
+from forewarp.scene.camera import mean_up
+from forewarp.scene.cloud import Ellipsoids
+
+_FPS = 24.0  # time codes a second, OpenUSD's own default
+_ALONG = (
+    0.98  # cosine of the angle between the upward direction and an axis, from which on the world is upright
+)
+_REACH = 3.0  # standard deviations that the extent holds
+_UP_AXES = {"y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
+
+
+def export_usd(
+    source: Source, folder: Path, progress: Progress, *, degree: int, up: str, seconds: float
+) -> dict:
+    """Write ``scene.usdc``: one prim, whose attributes that change have a sample at each time, between which
+    readers interpolate linearly.
+
+    Args:
+        source: the scene and its times.
+        folder: to write into.
+        progress: called after each time.
+        degree: of the spherical harmonics, at most that of the run.
+        up: the axis that points upwards, ``y`` or ``z``; ``world``: that of the two along which the data's
+            own world is upright, else z.
+        seconds: duration from time 0 to time 1.
+
+    Returns:
+        the facts for ``about.json``.
+
+    Raises:
+        ValueError: for a method without particles, for another axis, or an OpenUSD that knows no Gaussians.
+    """
+    from pxr import Gf, Usd, UsdGeom, UsdVol, Vt
+
+    if not source.has_ellipsoids:
+        raise ValueError(
+            f"format=usd: expected a method made of particles, but got {source.model}; use another format"
+        )
+    if not hasattr(UsdVol, "ParticleField3DGaussianSplat"):
+        version = ".".join(map(str, Usd.GetVersion()[1:]))
+        raise ValueError(f"format=usd: expected OpenUSD 26.03 or later, but got {version}; update usd-core")
+    axis, rotation = upright(source, up)
+    own_degree = math.isqrt(source.method.template().harmonics.shape[1]) - 1
+    degree = min(degree, own_degree)
+    clouds, total = [], len(source.times)
+    for number, time in enumerate(source.times, 1):
+        clouds.append(samples(source.method.ellipsoids(time), rotation, degree))
+        progress(number, total)
+    for before, cloud in zip(clouds, clouds[1:]):  # the shorter way round
+        flips = (before["orientations"] * cloud["orientations"]).sum(-1, keepdims=True) < 0
+        cloud["orientations"] = np.where(flips, -1, 1).astype(np.float32) * cloud["orientations"]
+    codes = [time * seconds * _FPS for time in source.times]
+
+    stage = Usd.Stage.CreateNew(str(folder / "scene.usdc"))
+    UsdGeom.SetStageUpAxis(stage, axis.upper())
+    UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+    stage.SetTimeCodesPerSecond(_FPS)
+    stage.SetFramesPerSecond(_FPS)
+    stage.SetStartTimeCode(codes[0])
+    stage.SetEndTimeCode(codes[-1])
+    root = UsdGeom.Xform.Define(stage, "/scene")
+    stage.SetDefaultPrim(root.GetPrim())
+    field = UsdVol.ParticleField3DGaussianSplat.Define(stage, "/scene/particles")
+    field.CreateRadianceSphericalHarmonicsDegreeAttr(degree)
+    field.CreateSortingModeHintAttr("cameraDistance")
+    reach = _REACH * max(float(cloud["scales"].max()) for cloud in clouds)
+    corners = [cloud["positions"] for cloud in clouds]
+    low, high = np.min([c.min(0) for c in corners], 0) - reach, np.max([c.max(0) for c in corners], 0) + reach
+    field.CreateExtentAttr(Vt.Vec3fArray([Gf.Vec3f(*low.tolist()), Gf.Vec3f(*high.tolist())]))
+    attributes = {
+        "positions": (field.CreatePositionsAttr(), Vt.Vec3fArray),
+        "orientations": (field.CreateOrientationsAttr(), Vt.QuatfArray),
+        "scales": (field.CreateScalesAttr(), Vt.Vec3fArray),
+        "opacities": (field.CreateOpacitiesAttr(), Vt.FloatArray),
+        "harmonics": (field.CreateRadianceSphericalHarmonicsCoefficientsAttr(), Vt.Vec3fArray),
+    }
+    sampled = []
+    for name, (attribute, array) in attributes.items():
+        values = [array.FromNumpy(np.ascontiguousarray(cloud[name])) for cloud in clouds]
+        attribute.Set(values[0])
+        if any(not np.array_equal(cloud[name], clouds[0][name]) for cloud in clouds[1:]):
+            sampled.append(name)
+            for code, value in zip(codes, values):
+                attribute.Set(value, code)
+    stage.Save()
+    return {
+        "particles": len(clouds[0]["positions"]),
+        "degree": degree,
+        "degree of the run": own_degree,
+        "seconds": seconds,
+        "sampled": sampled,
+        "off between times": off_between(source),
+        "axes in the file": f"{axis} up" + ("" if rotation is None else ", turned from the data's world"),
+        "colors": "sRGB, as in the images: 1/2 + 0.28209479177387814 of the first coefficient is the mean",
+    }
+
+
+def upright(source: Source, up: str) -> tuple[str, Tensor | None]:
+    """Return the axis, ``y`` or ``z``, that points upwards, and the rotation (3, 3) that turns the world so;
+    None: as it is.
+
+    Raises:
+        ValueError: for an axis that OpenUSD has not.
+    """
+    if up not in ("world", *_UP_AXES):
+        raise ValueError(f"up: expected world, y or z with format=usd, but got {up}")
+    if up != "world":
+        return up, source.rotation_to(up)
+    upwards = mean_up(list(source.cameras)).double()
+    for axis, direction in _UP_AXES.items():
+        if float(upwards @ torch.tensor(direction, dtype=torch.float64)) > _ALONG:
+            return axis, None
+    return "z", source.rotation_to("z")
+
+
+def samples(cloud: Ellipsoids, rotation: Tensor | None, degree: int) -> dict[str, np.ndarray]:
+    """Return a time's sample of each attribute, float32; quaternions lie as OpenUSD's do: x, y, z, w."""
+    cloud = cloud if rotation is None else cloud.turned(rotation)
+    scales, quaternions = cloud.axes
+    harmonics = cloud.harmonics[:, : (degree + 1) ** 2].reshape(-1, 3)
+    parts = cloud.centers, quaternions.roll(-1, -1), scales, cloud.opacity, harmonics
+    names = "positions", "orientations", "scales", "opacities", "harmonics"
+    return {name: part.detach().float().cpu().numpy() for name, part in zip(names, parts)}
+
+
+def off_between(source: Source) -> dict[str, float]:
+    """Measure how far a straight way between samples leads from the run's own, halfway between two times:
+    world units, the largest distance and that which 99 % of the particles stay below.
+    """
+    times, method = list(source.times), source.method
+    away = [torch.zeros(1)]
+    for before, after in zip(times, times[1:]):
+        ends = [method.ellipsoids(time).centers for time in (before, after)]
+        middle = method.ellipsoids((before + after) / 2).centers
+        away.append((middle - (ends[0] + ends[1]) / 2).norm(dim=-1).cpu())
+    distances = torch.cat(away)
+    return {"largest": float(distances.max()), "99 %": float(distances.quantile(0.99))}

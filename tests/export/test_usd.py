@@ -1,0 +1,116 @@
+"""``format=usd``, as usd-core reads it."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from tests.export.conftest import TIMES, exporter
+from tests.support.particles import module_with, shaken, small_data
+from tests.support.tiny_scene import camera_at
+
+pytest.importorskip("pxr")
+from pxr import Usd, UsdGeom, UsdVol
+
+export = exporter("usd", degree=3, up="world", seconds=4.0)
+FPS = 24
+
+
+def opened(folder):
+    """The stage and its particles."""
+    stage = Usd.Stage.Open(str(folder / "scene.usdc"))
+    return stage, UsdVol.ParticleField3DGaussianSplat(stage.GetPrimAtPath("/scene/particles"))
+
+
+def arrays(field, code):
+    """What the particles are at a time code: centers, covariances, opacities and harmonics, as tensors."""
+    positions, scales = (np.array(a.Get(code)) for a in (field.GetPositionsAttr(), field.GetScalesAttr()))
+    turned = field.GetOrientationsAttr().Get(code)
+    quaternions = np.array([[*q.GetImaginary(), q.GetReal()] for q in turned])
+    axes = Rotation.from_quat(quaternions).as_matrix() * scales[:, None]
+    harmonics = np.array(field.GetRadianceSphericalHarmonicsCoefficientsAttr().Get(code))
+    degree = field.GetRadianceSphericalHarmonicsDegreeAttr().Get()
+    parts = positions, axes @ axes.transpose(0, 2, 1), np.array(field.GetOpacitiesAttr().Get(code))
+    return [
+        torch.from_numpy(np.asarray(p, np.float32))
+        for p in (*parts, harmonics.reshape(-1, (degree + 1) ** 2, 3))
+    ]
+
+
+def test_samples_are_the_run_and_between_them_it_goes_straight(particles, tmp_path):
+    about = export(particles, tmp_path / "usd")
+    stage, field = opened(tmp_path / "usd")
+    assert (stage.GetStartTimeCode(), stage.GetEndTimeCode()) == (0, 4 * FPS)
+    assert stage.GetTimeCodesPerSecond() == stage.GetFramesPerSecond() == FPS
+    assert UsdGeom.GetStageMetersPerUnit(stage) == 1
+    assert stage.GetDefaultPrim().GetPath() == "/scene"
+    assert about["degree"] == 2
+    assert field.GetPositionsAttr().GetTimeSamples() == [time * 4 * FPS for time in TIMES]
+    low, high = (torch.tensor(corner) for corner in field.GetExtentAttr().Get())
+    for time in TIMES:
+        cloud = particles.method.ellipsoids(time)
+        wanted = cloud.centers, cloud.covariances, cloud.opacity, cloud.harmonics
+        for found, value in zip(arrays(field, time * 4 * FPS), wanted):
+            torch.testing.assert_close(found, value, atol=2e-5, rtol=1e-4)
+        assert bool(((cloud.centers > low) & (cloud.centers < high)).all())
+    away = []
+    for before, after in zip(TIMES, TIMES[1:]):
+        time = (before + after) / 2
+        found, _, _, _ = arrays(field, time * 4 * FPS)
+        away.append((found - particles.method.ellipsoids(time).centers).norm(dim=-1).max())
+    assert float(max(away)) == pytest.approx(about["off between times"]["largest"], rel=1e-3)
+    assert 0 < about["off between times"]["99 %"] <= about["off between times"]["largest"]
+
+
+def test_more_times_are_nearer_to_the_run(particles, tmp_path):
+    off = []
+    for count in (9, 17, 33):
+        source = replace(particles, times=[i / (count - 1) for i in range(count)])
+        off.append(export(source, tmp_path / "usd", degree=0)["off between times"]["99 %"])
+    assert (
+        off[0] > 2.5 * off[1] > 2.5 * 2.5 * off[2] > 0
+    )  # as the square of the step, where curves bend alike
+
+
+def test_quaternions_go_the_shorter_way(particles, tmp_path):
+    source = replace(particles, times=[i / 12 for i in range(13)])
+    export(source, tmp_path / "usd")
+    _, field = opened(tmp_path / "usd")
+    turned = [
+        np.array([[*q.GetImaginary(), q.GetReal()] for q in field.GetOrientationsAttr().Get(8.0 * i)])
+        for i in range(13)
+    ]
+    assert min((a * b).sum(-1).min() for a, b in zip(turned, turned[1:])) >= 0
+
+
+@pytest.mark.parametrize(("up", "axis"), [("world", "Z"), ("z", "Z"), ("y", "Y")])
+def test_the_stage_says_which_axis_is_upwards_and_the_particles_are_turned_so(particles, tmp_path, up, axis):
+    level = replace(particles, cameras=[camera_at(i / 8) for i in range(8)])
+    export(level, tmp_path / "usd", up=up)
+    stage, field = opened(tmp_path / "usd")
+    assert UsdGeom.GetStageUpAxis(stage) == axis
+    cloud = particles.method.ellipsoids(TIMES[1])
+    turned = cloud if up == "world" else cloud.turned(level.rotation_to(up))
+    for found, value in zip(arrays(field, TIMES[1] * 4 * FPS), (turned.centers, turned.covariances)):
+        torch.testing.assert_close(found, value, atol=2e-5, rtol=1e-4)
+    torch.testing.assert_close(arrays(field, TIMES[1] * 4 * FPS)[3], turned.harmonics, atol=1e-4, rtol=1e-3)
+
+
+def test_what_does_not_change_has_no_samples(particles, tmp_path):
+    module = shaken(module_with(small_data(), motion=None, rotation=None))
+    about = export(replace(particles, module=module), tmp_path / "usd")
+    _, field = opened(tmp_path / "usd")
+    assert about["sampled"] == []
+    assert field.GetPositionsAttr().GetNumTimeSamples() == 0
+    assert len(field.GetPositionsAttr().Get()) == about["particles"]
+    assert about["off between times"]["largest"] == 0
+
+
+def test_other_axes_and_methods_are_refused(particles, ball, tmp_path):
+    with pytest.raises(ValueError, match="up: expected world, y or z with format=usd, but got -y"):
+        export(particles, tmp_path / "usd", up="-y")
+    with pytest.raises(ValueError, match="format=usd: expected a method made of particles, but got forward"):
+        export(ball, tmp_path / "usd")
+    assert list(tmp_path.iterdir()) == []
