@@ -134,8 +134,16 @@ def with_depth(value):
             "depth is 3000 in the median, with near at 1 and far at 5.5; write it in the units",
         ),
         (
-            replace(SCENE, train=[replace(f, camera=replace(f.camera, fx=2.0)) for f in SCENE.train]),
+            replace(SCENE, train=[replace(f, camera=replace(f.camera, fx=2.0, fy=2.0)) for f in SCENE.train]),
             "images are 152 degrees wide, as if focal lengths were in millimetres; write them in pixels",
+        ),
+        (
+            replace(SCENE, train=[replace(f, camera=replace(f.camera, fy=10.0)) for f in SCENE.train]),
+            "pixels are 0.521 times as wide as high",
+        ),
+        (
+            replace(SCENE, train=[replace(f, camera=SCENE.train[0].camera) for f in SCENE.train]),
+            "in one place",
         ),
     ],
 )

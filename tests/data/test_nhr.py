@@ -252,6 +252,16 @@ def test_clouds_of_other_frames_are_not_taken(toy):
         read_scene(toy.parent, "toy")
 
 
+def test_clouds_that_are_counted_from_0_are_taken_in_order(toy):
+    expected = read_scene(toy.parent, "toy").box
+    for number in (1, 2, 3):
+        cloud = toy / "pointclouds" / f"frame{number}.npy"
+        cloud.rename(cloud.with_name(f"frame{number - 1}.npy"))
+    scene = read_scene(toy.parent, "toy")
+    assert scene.box == expected
+    assert "frame0.npy to frame2.npy (3) taken in the order of the frames" in scene.protocol["assumed"][0]
+
+
 def test_two_folders_of_one_number_are_named(toy):
     shutil.copytree(toy / "img" / "2", toy / "img" / "002")
     with pytest.raises(SceneError, match=r"got 002 and 2; remove one"):

@@ -25,6 +25,7 @@ _SIDE, _HOLLOW = (
 _WITHIN = 5  # points along a side of the box that cameras are asked for
 _FAINT = 8  # of 255: alpha that is nowhere above it was written as 0 and 1
 _WIDEST, _ZOOMED = 130, 1.25  # degrees of a pinhole camera; focal lengths of test and training images
+_STRETCHED, _SAME_PLACE = 1.25, 1e-9  # sides of a pixel; share of the cameras' distance from the origin
 _CUT_OFF, _FEW = 0.1, 0.5  # share of the subject beyond the box; of pixels and points that is too few
 # What mends near or far, the box, and all three, by format; "" is any other.
 _REMEDIES = {
@@ -51,7 +52,7 @@ def remarks(scene: Scene) -> Iterator[str]:
     Cost: eight training images are decoded, which training does anyway; all, where those show nothing.
     """
     aim = common_point([frame.camera.camera_to_world for frame in scene.train])
-    aside = list(_angles(scene)) or ([] if aim is None else list(_aimed(scene, aim)))
+    aside = list(_pinholes(scene)) or ([] if aim is None else list(_aimed(scene, aim)))
     yield from aside or _of_test_images(scene)
     if scene.has_alpha:
         yield from _silhouettes(scene, bounded=not aside)
@@ -75,8 +76,14 @@ def remarks(scene: Scene) -> Iterator[str]:
             )
 
 
-def _angles(scene: Scene) -> Iterator[str]:
-    """Say that cameras see more than a pinhole camera can show."""
+def _pinholes(scene: Scene) -> Iterator[str]:
+    """Say that cameras stand in one place, have no square pixels, or see more than a pinhole camera shows."""
+    places = torch.stack([frame.camera.center for frame in scene.train])
+    if len(places) > 1 and float((places - places[0]).abs().max()) <= _SAME_PLACE * float(places.abs().max()):
+        yield "training cameras all stand in one place, which tells nothing of depth; compare their poses"
+    stretched = [frame.camera.fy / frame.camera.fx for frame in scene.train]
+    if not 1 / _STRETCHED < (ratio := float(torch.tensor(stretched).median())) < _STRETCHED:
+        yield f"pixels are {ratio:.3g} times as wide as high, by their focal lengths; compare both"
     widest = max(max(f.camera.width / f.camera.fx, f.camera.height / f.camera.fy) for f in scene.train)
     if (degrees := math.degrees(2 * math.atan(widest / 2))) > _WIDEST:
         line = f"training images are {degrees:.0f} degrees wide, as if focal lengths were in millimetres"

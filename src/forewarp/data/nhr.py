@@ -274,7 +274,7 @@ def _bounds(folder: Path, numbers: Sequence[int], count: int) -> tuple[Box, list
             clouds[int(path.stem[5:])] = path
     chosen = [clouds.get(number + 1, folder / "pointclouds" / f"frame{number + 1}.npy") for number in numbers]
     assumed, are_there = [], all(path.is_file() for path in chosen)
-    if not are_there and len(clouds) == count and numbers[0] != 0:
+    if not are_there and len(clouds) == count and (numbers[0] != 0 or 0 in clouds):
         chosen = [clouds[number] for number in sorted(clouds)][: len(numbers)]
         said = f"{chosen[0].name} to {chosen[-1].name} ({len(chosen)}) taken in the order of the frames"
         assumed = [f"{folder / 'pointclouds'}: {said}"]
