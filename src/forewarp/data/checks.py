@@ -18,10 +18,7 @@ from forewarp.scene.frame import Frame, Scene, sightings, spread
 _LOOKED_AT = 8  # training images whose alpha is looked at
 _PIXELS = 4000  # of each
 _EDGE, _LEFT_OUT = 0.9, 0.02  # shares of an inverted image: subject along its edges, background at least
-_SIDE, _HOLLOW = (
-    0.5,
-    0.33,
-)  # of one whose subject crosses the edges: at two opposite sides, in its middle ninth
+_SIDE, _HOLLOW = 0.5, 0.33  # of one whose subject crosses edges: at two opposite ones, in its middle ninth
 _WITHIN = 5  # points along a side of the box that cameras are asked for
 _FAINT = 8  # of 255: alpha that is nowhere above it was written as 0 and 1
 _WIDEST, _ZOOMED = 130, 1.25  # degrees of a pinhole camera; focal lengths of test and training images
@@ -44,7 +41,8 @@ def remarks(scene: Scene) -> Iterator[str]:
     """Say what in a scene is probably not what was meant, a line each, with what mends it.
 
     That is a range or box without the point that all cameras look at, or without a part of the subject;
-    inverted, empty or opaque alpha and masks; masks that leave little; points that no camera sees.
+    inverted, empty or opaque alpha and masks; masks that leave little; points that no camera sees; cameras in
+    one place, no pinholes, or of test images in other units.
 
     Raises:
         SceneError: if no training image shows anything.
