@@ -29,7 +29,7 @@ def test_a_method_that_knows_no_matter_is_refused_in_one_line(tmp_path, kind):
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize(("kind", "extra"), [("mesh", "export"), ("html", "viewer"), ("usd", "usd")])
+@pytest.mark.parametrize(("kind", "extra"), [("mesh", "export"), ("usd", "usd")])
 def test_without_its_extra_a_format_says_what_to_install(monkeypatch, kind, extra):
     monkeypatch.setattr(formats, "find_spec", lambda name: None)
     with pytest.raises(ImportError, match=rf"format={kind}: .* got none; install forewarp\[{extra}\]"):

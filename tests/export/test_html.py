@@ -1,144 +1,342 @@
-"""The exported page: what is in it, and the page in a real browser."""
+"""The page that plays a scene: what is in it, and the page in a real browser."""
 
 import base64
+import html
 import io
 import re
+import zlib
+from dataclasses import replace
 
 import imageio.v3 as iio
-import msgspec
 import numpy as np
 import pytest
 import torch
-import zstandard
-from scipy.spatial import KDTree
 
-from tests.export.conftest import TIMES, exporter
+from forewarp.drawing.images import to_bytes
+from forewarp.export.glb import packed_scene
+from forewarp.export.html import _PLAYER, page, poster
+from forewarp.glb import meshopt
+from forewarp.metrics.image import psnr
+from forewarp.scene.view import Moment, View
+from tests.export.conftest import exporter
+from tests.glb.test_meshopt import elements
 from tests.support.browser import Tab, chromium, until
 
-export = exporter("html", points=200, seconds=2.0, megabytes=20.0)
+export = exporter("html", quality="lossless", seconds=2.0)
+ATTACK = "\"'><img src=x onerror=attacked=1></script><script>attacked=1</script> {{scene}} – Ünï\u2028🙂"
+CODE = 100_000  # bytes of the page besides scene and poster
 
 
-def read(folder):
-    """What the page plays: pairs of a second and a message, with arrays in their places."""
-    text = (folder / "scene.html").read_text()
-    data = base64.b64decode(re.search(r'__VISER_EMBED_DATA__="([^"]+)"', text)[1])
-    size = int.from_bytes(data[:8], "little")
-    raw = zstandard.ZstdDecompressor().decompress(data[8:], max_output_size=size)
-    at = 8 + int.from_bytes(raw[:8], "little")
-    content, buffers = msgspec.msgpack.decode(raw[8:at]), []
-    for length in content["binaryBufferLengths"]:
-        at += -at % 8
-        buffers.append(raw[at : at + length])
-        at += length
-
-    def filled(value):
-        if isinstance(value, dict) and "__binary_index" in value:
-            return np.frombuffer(buffers[value["__binary_index"]], value["dtype"])
-        return {key: filled(part) for key, part in value.items()} if isinstance(value, dict) else value
-
-    return content["durationSeconds"], [(second, filled(message)) for second, message in content["messages"]]
-
-
-def shown(messages, part, last):
-    """The scene's props at the start, and what it is when everything until a second was played."""
-    of_scene = [(s, m) for s, m in messages if m.get("name") == "/scene" and s <= last]
-    props = next(dict(m["props"]) for _, m in of_scene if "props" in m)
-    for _, message in of_scene:
-        props |= message.get("updates", {})
-    return props, props[part]
-
-
-def test_particles_are_splats_of_each_time(particles, tmp_path):
+def test_the_page_holds_the_scene_and_fetches_nothing(particles, tmp_path):
     about = export(particles, tmp_path / "html")
-    assert "thinned" not in about
-    duration, messages = read(tmp_path / "html")
-    assert duration == pytest.approx(3.0)  # the last time is shown as long as others are, on average
-    for time in TIMES:
-        cloud = particles.method.ellipsoids(time)
-        props, buffer = shown(messages, "buffer", 2 * time + 1e-6)
-        table = buffer.view("<f4").reshape(-1, 8)
-        assert len(table) == len(cloud) == about["particles"]
-        chosen = KDTree(cloud.centers).query(props["scale"] * table[:, :3])[1]
-        assert len(set(chosen)) == len(chosen)
-        np.testing.assert_allclose(props["scale"] * table[:, :3], cloud.centers[chosen], atol=1e-5)
-        halves = props["scale"] ** 2 * buffer.view("<f2").reshape(-1, 16)[:, 8:14].astype(np.float32)
-        wanted = cloud.covariances[chosen][:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
-        largest = wanted.abs().amax(-1, keepdim=True)
-        assert float((abs(torch.from_numpy(halves) - wanted) / largest).max()) < 2e-3
-        rgba = buffer.view("u1").reshape(-1, 32)[:, 28:] / 255
-        np.testing.assert_allclose(rgba[:, :3], cloud.colors[chosen], atol=0.005)
-        np.testing.assert_allclose(rgba[:, 3], cloud.opacity[chosen], atol=0.005)
+    text = (tmp_path / "html" / "scene.html").read_text()
+    held = re.search(r'id="scene">([^<]+)<', text)[1]
+    content, facts = packed_scene(particles, "html", quality="lossless", seconds=2.0)
+    assert zlib.decompress(base64.b64decode(held), wbits=-15) == content
+    assert facts.items() <= about.items()
+    assert facts["moving"] < facts["particles"] <= len(particles.method.means)
+    picture = re.search(r'src="data:image/jpeg;base64,([^"]+)"', text)[1]
+    camera = particles.cameras[0]
+    assert iio.imread(base64.b64decode(picture)).shape == (camera.height, camera.width, 3)
+    assert len(text) - len(held) - len(picture) < CODE
+    assert re.findall(r"https?://|\{\{", text) == []
 
 
-@pytest.mark.parametrize("shade", [0, 255])
-def test_voxels_are_points_of_each_time_before_the_background_of_exact_images(ball, tmp_path, shade):
-    object.__setattr__(ball, "background", (shade / 255,) * 3)
-    about = export(ball, tmp_path / "html")
-    _, messages = read(tmp_path / "html")
-    first = torch.from_numpy(shown(messages, "points", 0.0)[1].reshape(-1, 3).copy())
-    assert len(first) == about["points"] == 200
-    wanted = ball.method.trajectories(first, torch.tensor(TIMES))
-    for row, time in enumerate(TIMES):
-        props, points = shown(messages, "points", 2 * time + 1e-6)
-        np.testing.assert_allclose(points.reshape(-1, 3), wanted[:, row], atol=1e-5)
-        np.testing.assert_allclose(props["colors"].reshape(-1, 3) / 255, torch.sigmoid(2 * first), atol=0.005)
-    behind = [message["rgb_data"] for _, message in messages if message["type"] == "BackgroundImageMessage"]
-    assert (iio.imread(io.BytesIO(bytes(behind[-1])))[..., :3] == shade).all()
+def test_names_are_text_in_the_page(particles):
+    text = page(b"", title=ATTACK, poster=torch.zeros(2, 2, 3), background=(1.0, 0.5, 0.0))
+    assert text.count("<script") == 3
+    assert "<img src=x" not in text
+    assert html.unescape(re.search("<title>(.*)</title>", text)[1]) == ATTACK
+    assert 'style="background: rgb(255 128 0)"' in text
 
 
-def test_what_does_not_fit_is_left_out_and_said(particles, tmp_path):
-    object.__setattr__(particles, "times", tuple(i / 39 for i in range(40)))
-    most = 0.87  # viser's own page has 0.82
-    about = export(particles, tmp_path / "html", megabytes=most)
-    assert (tmp_path / "html" / "scene.html").stat().st_size <= most * 1e6
-    count = len(particles.method.means)
-    assert about["thinned"] == f"{about['particles']} of {count} particles, 12 of 40 times"
-    assert 10 < about["particles"] < count
-    seconds = sorted({second for second, _ in read(tmp_path / "html")[1]})
-    np.testing.assert_allclose(seconds, 2 * np.array(about["times on the page"]), atol=1e-6)
-    with pytest.raises(ValueError, match="megabytes: expected room for the page, but got 0.5"):
-        export(particles, tmp_path / "none", megabytes=0.5)
+def test_scripts_and_styles_name_parts_that_there_are():
+    text = (_PLAYER / "player.html").read_text()
+    script = "".join(file.read_text() for file in _PLAYER.glob("*.js"))
+    named = set(re.findall(r'byId\("([\w-]+)"\)', script)) | set(re.findall(r'click\("([\w-]+)"', script))
+    named |= set(re.findall(r"#([a-z]+)\b[^;]*\{", (_PLAYER / "player.css").read_text()))
+    assert named <= set(re.findall(r'id="([\w-]+)"', text))
+
+
+def test_a_method_without_particles_is_refused_with_what_it_can_give(ball, tmp_path):
+    with pytest.raises(
+        ValueError, match=r"^format=html: expected .* but got forward; use format=mesh or gltf"
+    ):
+        export(ball, tmp_path / "html")
+    assert list(tmp_path.iterdir()) == []
+
+
+# In a browser ----------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def browser():
+    with chromium() as found:
+        yield found
+
+
+@pytest.fixture
+def opened(browser, particles, tmp_path):
+    """``opened(address="", **options)``: the page of ``particles`` in a tab that complains of nothing."""
+    source = replace(particles, name=ATTACK)
+    export(source, tmp_path / "html")
+    tabs = []
+
+    def open_page(address="", **options):
+        tab = Tab(browser, None, **{"width": 320, "height": 320} | options)
+        tab.page.goto((tmp_path / "html" / "scene.html").as_uri() + address)
+        tab.page.evaluate(SETTLED)
+        tabs.append(tab)
+        return tab
+
+    yield open_page
+    for tab in tabs:
+        assert tab.errors == []
+        tab.page.close()
+
+
+SETTLED = "forewarp.then((door) => door && door.settled())"
+PIXELS = """(asked) => forewarp.then((door) => {
+  const bytes = new Uint8Array(door.pixels(asked).buffer);
+  let text = "";
+  for (let i = 0; i < bytes.length; i += 32768) text += String.fromCharCode(...bytes.subarray(i, i + 32768));
+  return btoa(text);
+})"""
+
+
+def state(tab, *names):
+    """What the page's player has."""
+    return tab.page.evaluate(f"forewarp.then(({{player}}) => [{', '.join(f'player.{n}' for n in names)}])")
+
+
+def rendered(source, camera, time, background=None):
+    """The image (H, W, 3) that the run renders."""
+    background = torch.tensor(source.background if background is None else background)
+    image = source.method.at(Moment(time)).render(View(camera), background)
+    return image.rgb.detach().reshape(camera.height, camera.width, 3).clamp(max=1)
+
+
+def drawn(tab, source, **asked):
+    """The image that the page draws, of its floats."""
+    text = tab.page.evaluate(PIXELS, asked)
+    rgba = torch.frombuffer(bytearray(base64.b64decode(text)), dtype=torch.float32)
+    rgba = rgba.reshape(asked["height"], asked["width"], 4)
+    return (rgba[..., :3] + (1 - rgba[..., 3:]) * torch.tensor(source.background)).clamp(max=1)
+
+
+def shown(tab):
+    """The image that the tab shows, in [0, 1]."""
+    return torch.from_numpy(iio.imread(io.BytesIO(tab.page.screenshot()))[..., :3].astype(np.float32) / 255)
+
+
+def cameras_of(source):
+    """The cameras of the file: the first one, then some that are spread."""
+    return [source.cameras[0], *source.cameras]
+
+
+def fitted(camera, width, height):
+    """The camera of a larger image of another form, in the middle of which is all of its own."""
+    scale = min(width / camera.width, height / camera.height)
+    camera = camera.resized(round(scale * camera.width), round(scale * camera.height))
+    cx, cy = camera.cx + (width - camera.width) / 2, camera.cy + (height - camera.height) / 2
+    return replace(camera, width=width, height=height, cx=cx, cy=cy)
 
 
 @pytest.mark.browser
 @pytest.mark.slow
-def test_its_slider_goes_through_time_when_the_page_is_opened_as_a_file(particles, ball, tmp_path):
-    with chromium() as browser:
-        for source in (particles, ball):
-            folder = tmp_path / source.model
-            export(source, folder)
-            tab = Tab(browser, None, width=480, height=360)
-            tab.page.goto((folder / "scene.html").as_uri())
-            tab.page.locator("input").first.fill("1.0", timeout=30000)  # typing stops the recording
-            begin = until(settled, tab, 0.0)
-            end = until(settled, tab, 1.9, begin, 0.5)
-            until(settled, tab, 0.0, begin, 0.0, 0.3 * away(end, begin))
-            # Splats are sorted by a worker, which browsers refuse to such a page at its plain address.
-            workers = [worker.url.partition(":")[0] for worker in tab.page.workers]
-            assert workers == (["data"] if source is particles else [])
-            assert tab.errors == []
-            tab.page.close()
+def test_it_draws_what_the_method_renders(particles, opened):
+    tab, cameras = opened(), cameras_of(particles)
+    assert state(tab, "renderer.bits", "scene.cameras.length") == [32, len(cameras)]
+    for number in range(10):
+        time, which = number / 9, number % len(cameras)
+        size = {"width": 160, "height": 120 + 10 * number}
+        wanted = rendered(particles, fitted(cameras[which], **size), time)
+        got = drawn(tab, particles, time=time, camera=which, **size)
+        assert psnr(got, wanted) > 50
+        assert float((wanted - wanted[0, 0]).abs().max()) > 0.2
 
 
-def settled(tab, second, before=0.0, least=0.0, most=float("inf")):
-    """Go to a second; the image once it stays, and differs from the one before as it should."""
-    field = tab.page.locator("input").first
-    if field.input_value() != f"{second}":
-        field.fill(f"{second}")
-    first = shot(tab)
-    tab.page.wait_for_timeout(500)  # splats fade in
-    image = shot(tab)
-    stays = away(first, image) < 0.05 and image.std() > 5
-    return image if stays and least <= away(before, image) <= most else None
+@pytest.mark.browser
+@pytest.mark.slow
+def test_what_is_shown_follows_the_address(particles, opened):
+    cameras = cameras_of(particles)
+    for number, time in ((0, 0.0), (2, 0.5), (3, 1.0)):
+        tab = opened(f"?t={time}&controls=0&camera={number}")
+        wanted = rendered(particles, cameras[number].resized(320, 320), time)
+        assert psnr(shown(tab), wanted) > 40
+        assert state(tab, "playing", "time", "camera") == [False, time, number]
+    tab = opened("?t=0.25&camera=1#t=0.75&layer=resting")
+    assert state(tab, "time", "camera", "layer") == [0.75, 1, "resting"]
+    tab.page.evaluate("location.hash = 't=0.5&camera=2'")
+    until(lambda: state(tab, "time", "camera") == [0.5, 2])
+    tab = opened("?t=x&camera=99&layer=none&autoplay=0")
+    assert state(tab, "playing", "time", "camera", "layer") == [False, 0, 0, "all"]
+    assert state(opened("?t=0.2&autoplay=1"), "playing") == [True]
 
 
-def shot(tab):
-    """What the page shows, beside viser's notice."""
-    box = tab.canvas()
-    clip = box | {"x": box["x"] + 0.4 * box["width"], "width": 0.6 * box["width"]}
-    return iio.imread(io.BytesIO(tab.page.screenshot(clip=clip)))[..., :3].astype(float)
+@pytest.mark.browser
+@pytest.mark.slow
+def test_layers_together_are_the_scene(particles, opened):
+    tab, method = opened(), particles.method
+    camera, moves = cameras_of(particles)[1].resized(100, 100), method.skinning.weights().sum(-1) > 0
+    asked = {"width": 100, "height": 100, "time": 0.4, "camera": 1}
+    for layer, which in (("moving", moves), ("resting", ~moves), ("all", moves | ~moves)):
+        kept = method.opacity.data.clone()
+        method.opacity.data[~which] = -30.0
+        wanted = rendered(particles, camera, 0.4)
+        method.opacity.data.copy_(kept)
+        assert psnr(drawn(tab, particles, layer=layer, **asked), wanted) > 50
 
 
-def away(one, other):
-    """Mean difference of two images, of 255."""
-    return abs(one - other).mean()
+@pytest.mark.browser
+@pytest.mark.slow
+def test_it_is_played_turned_and_set_by_keys_and_mouse(opened):
+    tab = opened("?t=0.5")
+    page, first = tab.page, shown(tab)[60:240, 20:300]
+    page.keyboard.press(" ")
+    until(lambda: state(tab, "time")[0] != 0.5)
+    assert page.get_by_role("button", name="pause").is_visible()
+    page.keyboard.press(" ")
+    page.get_by_label("time", exact=True).fill("0.5")
+    page.evaluate(SETTLED)
+    assert psnr(shown(tab)[60:240, 20:300], first) > 45
+    before = state(tab, "eye")[0]
+    page.mouse.move(160, 120)
+    page.mouse.down()
+    page.mouse.move(220, 140, steps=3)
+    page.mouse.up()
+    assert state(tab, "eye")[0] != before
+    page.mouse.wheel(0, -300)
+    for key in ("ArrowLeft", "Shift+ArrowUp", "+", "-", "."):
+        page.keyboard.press(key)
+    page.evaluate(SETTLED)
+    assert psnr(shown(tab)[60:240, 20:300], first) < 30
+    page.keyboard.press("h")
+    page.keyboard.press(",")
+    page.evaluate(SETTLED)
+    assert state(tab, "time")[0] == pytest.approx(0.5)
+    assert psnr(shown(tab)[60:240, 20:300], first) > 45
+    page.get_by_role("button", name="view and playback").click()
+    page.get_by_text("moving", exact=True).click()
+    page.get_by_text("½").click()
+    page.get_by_role("button", name="trails").click()
+    assert state(tab, "layer", "speed", "trails") == ["moving", 0.5, True]
+    page.keyboard.press("Escape")
+    page.keyboard.press("?")
+    assert "32 bits" in page.get_by_role("dialog").inner_text()
+    page.keyboard.press("Escape")
+    assert not page.get_by_role("dialog").is_visible()
+
+
+@pytest.mark.browser
+@pytest.mark.slow
+def test_nothing_plays_by_itself_where_motion_is_not_wanted(opened):
+    assert state(opened(), "playing") == [True]
+    tab = opened(reduced_motion="reduce")
+    assert state(tab, "playing") == [False]
+    tab.page.goto(tab.page.url + "?autoplay=1")
+    tab.page.evaluate(SETTLED)
+    assert state(tab, "playing") == [False]
+
+
+@pytest.mark.browser
+@pytest.mark.slow
+def test_names_are_not_executed(opened):
+    tab = opened()
+    assert tab.page.evaluate("typeof attacked") == "undefined"
+    assert tab.page.evaluate("document.title") == tab.page.locator("h1").text_content() == ATTACK
+    assert tab.page.locator("img").count() == 0  # the poster has gone
+    assert {worker.url.partition(":")[0] for worker in tab.page.workers} == {"data"}
+
+
+@pytest.mark.browser
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("script", "says"),
+    [
+        ("HTMLCanvasElement.prototype.getContext = () => null", "no WebGL 2"),
+        ("delete window.WebGL2RenderingContext", "no WebGL 2"),
+        ("delete window.DecompressionStream", "too old"),
+    ],
+)
+def test_a_browser_that_cannot_play_it_shows_a_picture_and_says_so(
+    browser, particles, tmp_path, script, says
+):
+    export(particles, tmp_path / "html")
+    tab = Tab(browser, None, width=320, height=320)
+    tab.page.add_init_script(script)
+    tab.page.goto((tmp_path / "html" / "scene.html").as_uri())
+    assert tab.page.evaluate("forewarp") is None
+    assert says in tab.page.get_by_role("status").inner_text()
+    notice = tab.page.locator("#notice").bounding_box()
+    seen = to_bytes(poster(particles)).astype(float)
+    picture = to_bytes(shown(tab)).astype(float)
+    step = len(picture) // len(seen)
+    small = picture.reshape(len(seen), step, -1, step, 3).mean((1, 3))
+    above = small[: int(notice["y"]) // step], seen[: int(notice["y"]) // step]
+    assert len(above[0]) > len(seen) / 2
+    assert abs(above[0] - above[1]).mean() < 12
+    assert tab.errors == []
+    tab.page.close()
+
+
+@pytest.mark.browser
+@pytest.mark.slow
+def test_it_comes_back_after_the_graphics_card_was_taken_away(opened):
+    tab = opened("?t=0.5")
+    first = shown(tab)
+    lose = (
+        "forewarp.then(({player}) => (window.card = player.renderer.gl.getExtension('WEBGL_lose_context')))"
+    )
+    tab.page.evaluate(f"{lose}.then(() => card.loseContext())")
+    until(lambda: "taken away" in tab.page.locator("#notice").inner_text())
+    tab.page.evaluate("card.restoreContext()")
+    until(lambda: not tab.page.locator("#notice").is_visible())
+    tab.page.evaluate(SETTLED)
+    assert psnr(shown(tab), first) > 60
+    tab.errors[:] = [error for error in tab.errors if "CONTEXT_LOST" not in error]
+
+
+@pytest.mark.browser
+@pytest.mark.slow
+def test_it_works_inside_another_page(browser, particles, tmp_path, opened):
+    file = tmp_path / "outer.html"
+    export(particles, tmp_path / "inner")
+    file.write_text('<iframe src="inner/scene.html?t=0.5&camera=2&controls=0" width=320 height=320></iframe>')
+    tab = Tab(browser, None, width=400, height=400)
+    tab.page.goto(file.as_uri())
+    tab.page.frames[1].evaluate(SETTLED)
+    image = iio.imread(io.BytesIO(tab.page.locator("iframe").screenshot()))[
+        2:-2, 2:-2, :3
+    ]  # without its border
+    wanted = rendered(particles, cameras_of(particles)[2].resized(320, 320), 0.5)
+    assert psnr(torch.from_numpy(image.astype(np.float32) / 255), wanted) > 40
+    assert tab.errors == []
+    tab.page.close()
+
+
+@pytest.mark.browser
+@pytest.mark.slow
+def test_compressed_views_are_decoded_as_python_encodes_them(opened):
+    tab = opened()
+    decode = """([data, count, stride, filter]) => {
+      const bytes = decodeAttributes(Uint8Array.from(atob(data), (c) => c.charCodeAt(0)), count, stride);
+      unfilter(bytes, filter);
+      return [...bytes];
+    }"""
+
+    def decoded(made, kind="NONE"):
+        packed = base64.b64encode(meshopt.encode(made)).decode()
+        got = tab.page.evaluate(decode, [packed, *made.shape, kind])
+        return np.array(got, np.uint8).reshape(made.shape)
+
+    for count, stride in ((1, 4), (16, 8), (17, 12), (255, 4), (700, 12), (513, 64), (40, 256)):
+        made = elements(count, stride)
+        np.testing.assert_array_equal(decoded(made), made)
+    values = np.random.default_rng(0).normal(size=(300, 3)).astype(np.float32)
+    made = meshopt.exponential(values, -9)
+    np.testing.assert_array_equal(decoded(made, "EXPONENTIAL").view("<f4"), meshopt.from_exponential(made))
+    quaternions = np.random.default_rng(1).normal(size=(300, 4))
+    made = meshopt.quaternion(quaternions / np.linalg.norm(quaternions, axis=-1, keepdims=True), 9)
+    got, wanted = decoded(made, "QUATERNION").view("<i2"), meshopt.from_quaternion(made)
+    assert abs(got.astype(int) - wanted.astype(int)).max() <= 1

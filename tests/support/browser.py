@@ -45,8 +45,8 @@ def chromium():
 class Tab:
     """A page of the viewer in a context of its own; ``errors`` is what its console complains of."""
 
-    def __init__(self, browser, address: str | None, width: int = 900, height: int = 640) -> None:
-        self.page = browser.new_page(viewport={"width": width, "height": height})
+    def __init__(self, browser, address: str | None, width: int = 900, height: int = 640, **options) -> None:
+        self.page = browser.new_page(viewport={"width": width, "height": height}, **options)
         self.errors = []
         self.page.on("pageerror", lambda error: self.errors.append(str(error)))
         self.page.on("console", self._said)

@@ -11,9 +11,9 @@ What one types most:
   format=usd                    particles with time samples, for programs of OpenUSD 26.03 and later
   format=mesh                   the surface with colours, by marching cubes, a file a time
   format=gltf                   moving points as an animation, one file
-  format=html                   one page for a browser, without a server, with a time slider
+  format=html                   one page that plays particles in a browser, without a server
   format=npz                    trajectories of points with what is visible of them, and the method's arrays
-  times=N times=[0,0.5]         how many, evenly spaced, or which; not of glb, which holds all
+  times=N times=[0,0.5]         how many, evenly spaced, or which; not of glb and html, which hold all
   layer=moving|resting          only the particles that move, or those that rest
   out=FOLDER                    another folder
   degree=0|1|2|3                ply, usd: how finely colours depend on direction
@@ -21,10 +21,9 @@ What one types most:
   up=world|y|-y|z               ply, usd, mesh: which axis points upwards; -y for SuperSplat
   resolution=N level=SHARE      mesh: points of the lattice along the longest side; opacity of the surface
   files=ply|obj                 mesh: the files
-  points=N                      gltf, npz, html of voxels: most points
-  quality=compact|lossless      glb: rounded to what an eye can tell, or in float32
+  points=N                      gltf, npz: most points
+  quality=compact|lossless      glb, html: rounded to what an eye can tell, or in float32
   seconds=N                     glb, usd, gltf, html: how long the animation lasts
-  megabytes=N                   html: most of the page; what does not fit is left out, and said
   views=N                       npz: cameras that tell which points are visible
   trust=[PACKAGE]               code of other packages that the run's config may name
   data.root=FOLDER              where the data are now, if they moved
@@ -59,7 +58,7 @@ def export(config) -> None:
     cameras = [frame.camera for frame in scene.train]
     module.method = layer_of(module.method, config.layer, scene.train)
     background = tuple(run.datamodule.targets("train").background.tolist())
-    source = Source(module, method_name(saved), cameras, times, background)
+    source = Source(module, method_name(saved), cameras, times, background, scene.name)
     about = {"run": str(config.run), "scene": scene.name, "method": source.model, "layer": config.layer}
     options = {name: config[name] for name in FORMATS[config.format].options}
     with Counted(config.format) as progress:
@@ -72,8 +71,6 @@ def summary(about: dict) -> str:
 
     >>> summary({"bytes": {"a": 2_000_000, "b": 500_000}, "vertices": [7200, 72]})
     '2 files, 2.5 MB, at least 72 vertices each'
-    >>> summary({"bytes": {"a": 1000}, "points": 7, "thinned": "7 of 9 points"})
-    '1 file, 0.0 MB, 7 points; thinned to 7 of 9 points'
     """
     count, size = len(about["bytes"]), sum(about["bytes"].values())
     text = f"{count} file{'s' * (count != 1)}, {size / 1e6:.1f} MB"
@@ -81,7 +78,7 @@ def summary(about: dict) -> str:
         number = about[what]
         in_each_file = isinstance(number, list)
         text += f", at least {min(number):,} {what} each" if in_each_file else f", {number:,} {what}"
-    return text + (f"; thinned to {about['thinned']}" if "thinned" in about else "")
+    return text
 
 
 def check(config) -> list[float]:

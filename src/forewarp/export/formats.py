@@ -36,7 +36,7 @@ FORMATS = {
     "usd": Format("usd", ("degree", "up", "seconds"), "pxr", "usd"),
     "mesh": Format("ply", ("resolution", "level", "files", "up"), "skimage", "export"),
     "gltf": Format("tracks", ("points", "seconds")),
-    "html": Format("html", ("points", "seconds", "megabytes"), "viser", "viewer"),
+    "html": Format("html", ("quality", "seconds"), times=False),
     "npz": Format("tracks", ("points", "views")),
 }
 # The values that an option may have: words, or numbers from a least to a most.
@@ -48,7 +48,7 @@ CHOICES = {
     "up": ("world", "y", "-y", "z"),
 }
 WHOLE_NUMBERS = {"degree": (0, 3), "resolution": (8, 512), "points": (1, 10**6), "views": (1, 100)}
-NUMBERS = {"level": (0.01, 0.99), "seconds": (0.1, 3600), "megabytes": (1, 1000)}
+NUMBERS = {"level": (0.01, 0.99), "seconds": (0.1, 3600)}
 
 
 def require(kind: str) -> None:
@@ -106,7 +106,7 @@ def write(
     require(kind)
     export = getattr(import_module(f"forewarp.export.{FORMATS[kind].module}"), f"export_{kind}")
     with folder_written_whole(folder, ABOUT) as part:
-        if kind not in ("mesh", "glb", "usd"):  # which ask for matter alone, and for particles
+        if kind not in ("mesh", "glb", "usd", "html"):  # which ask for matter alone, and for particles
             source.check_tracks(kind)
         facts = export(source, part, progress, **options)
         files = sorted(file for file in part.rglob("*") if file.is_file())

@@ -40,7 +40,7 @@ def no_progress(done: int, total: int) -> None:
 @dataclass(frozen=True)
 class Source:
     """A fitted ``module``, named ``model`` in its config, the ``cameras`` it was trained with, ``times`` in
-    [0, 1], and the ``background`` (3,) in [0, 1] of its images.
+    [0, 1], the ``background`` (3,) in [0, 1] of its images, and the ``name`` of the scene.
     """
 
     module: DynamicSceneModule
@@ -48,6 +48,7 @@ class Source:
     cameras: Sequence[Camera]
     times: Sequence[float]
     background: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    name: str = "scene"
 
     @property
     def method(self) -> Method:

@@ -218,9 +218,8 @@ class Player {
     this.untimed = this.unsorted = this.stale = false;
     if (stale) this.paint(lively);
     this.last = lively ? now : 0;
-    if (lively) this.wake();
-    else if (this.stale) this.wake();
-    else if (!this.sorting.busy) this.waiting.splice(0).forEach((tell) => tell());
+    if (lively || this.stale) this.wake();
+    if (this.playing || !(lively || this.stale || this.sorting.busy)) this.waiting.splice(0).forEach((tell) => tell());
   }
 
   // Make pictures smaller while they come too slowly, and larger once they would not.
@@ -298,7 +297,7 @@ class Player {
     this.play(wanted && !reduced && this.scene.moving > 0);
   }
 
-  // Resolve once what the page shows is sharp and in the right order.
+  // Resolve once what the page shows is sharp and in the right order; while it plays, at once.
   settled() {
     return new Promise((tell) => {
       this.waiting.push(tell);
@@ -502,16 +501,21 @@ function doorOf(player) {
   };
 }
 
+// Say why there is only a picture, without controls that would do nothing.
+function giveUp(text) {
+  document.body.classList.add("bare");
+  tell(text);
+  return null;
+}
+
 async function main() {
   const quiet = matchMedia("(prefers-reduced-motion: reduce)");
   try {
     if (!window.WebGL2RenderingContext || !document.createElement("canvas").getContext("webgl2")) {
-      tell("This browser has no WebGL 2, by which the scene would move: this is a picture of it.");
-      return null;
+      return giveUp("This browser has no WebGL 2, by which the scene would move: this is a picture of it.");
     }
     if (!window.DecompressionStream) {
-      tell("This browser is too old to unpack the scene: this is a picture of it.");
-      return null;
+      return giveUp("This browser is too old to unpack the scene: this is a picture of it.");
     }
     const scene = readScene(await unpacked(byId("scene").textContent));
     byId("scene").remove();
@@ -527,7 +531,7 @@ async function main() {
     byId("poster").remove();
     return doorOf(player);
   } catch (error) {
-    tell(`The scene cannot be shown: ${error.message}.`);
+    giveUp(`The scene cannot be shown: ${error.message}.`);
     throw error;
   }
 }
