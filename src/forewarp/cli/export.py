@@ -58,7 +58,8 @@ def export(config) -> None:
     cameras = [frame.camera for frame in scene.train]
     module.method = layer_of(module.method, config.layer, scene.train)
     background = tuple(run.datamodule.targets("train").background.tolist())
-    source = Source(module, method_name(saved), cameras, times, background, scene.name)
+    taken = [frame.time for frame in scene.train]
+    source = Source(module, method_name(saved), cameras, times, background, scene.name, taken)
     about = {"run": str(config.run), "scene": scene.name, "method": source.model, "layer": config.layer}
     options = {name: config[name] for name in FORMATS[config.format].options}
     with Counted(config.format) as progress:

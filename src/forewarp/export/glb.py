@@ -4,13 +4,20 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from forewarp.export.tracks import Progress, Source
-from forewarp.glb.writer import Setting, rows_in_file, write
+import torch
+from torch import Tensor
+
+from forewarp.export.tracks import Progress, Source, no_progress
+from forewarp.fields.moving import MovingGaussians
+from forewarp.glb.writer import COMPACT, Setting, rows_in_file, write
 from forewarp.methods.method import HasBounds, HasMovingGaussians
+from forewarp.ops.backend import has_kernels
 from forewarp.scene.camera import focus_point
 from forewarp.scene.frame import spread
+from forewarp.scene.view import Moment
 
 _CAMERAS = 12  # of training, beside the first one
+_LEAST_PIXELS = 0.25  # of an image that particles make up; of those who make up less nothing is missed
 
 
 def export_glb(source: Source, folder: Path, progress: Progress, *, quality: str, seconds: float) -> dict:
@@ -19,7 +26,7 @@ def export_glb(source: Source, folder: Path, progress: Progress, *, quality: str
     Args:
         source: the scene.
         folder: to write into.
-        progress: called once.
+        progress: called after each image that is looked at.
         quality, seconds: see ``packed_scene``.
 
     Returns:
@@ -28,24 +35,26 @@ def export_glb(source: Source, folder: Path, progress: Progress, *, quality: str
     Raises:
         ValueError: see ``packed_scene``.
     """
-    content, facts = packed_scene(source, "glb", quality=quality, seconds=seconds)
+    content, facts = packed_scene(source, "glb", progress, quality=quality, seconds=seconds)
     (folder / "scene.glb").write_bytes(content)
-    progress(1, 1)
     axes = "y up, by the turn of its first node; what is below it is in the data's world"
     return facts | {"axes in the file": axes}
 
 
-def packed_scene(source: Source, kind: str, *, quality: str, seconds: float) -> tuple[bytes, dict]:
+def packed_scene(
+    source: Source, kind: str, progress: Progress = no_progress, *, quality: str, seconds: float
+) -> tuple[bytes, dict]:
     """Return the content of ``scene.glb``, and facts about it.
 
     Args:
         source: the scene.
         kind: the format that needs it.
+        progress: called after each image that is looked at.
         quality: ``compact`` or ``lossless``.
         seconds: how long a player takes from time 0 to time 1.
 
     Raises:
-        ValueError: for a method without particles, naming the formats that it has.
+        ValueError: for a method without particles, naming the formats that it has; where nothing is seen.
     """
     if not isinstance(source.method, HasMovingGaussians):
         others = ["mesh"] if isinstance(source.method, HasBounds) else []
@@ -54,11 +63,28 @@ def packed_scene(source: Source, kind: str, *, quality: str, seconds: float) -> 
         raise ValueError(
             f"format={kind}: expected a method made of particles, but got {source.model}{instead}"
         )
-    cameras = list(source.cameras)
-    shown = [cameras[0], *(cameras[i] for i in spread(len(cameras), _CAMERAS))]
-    focus = focus_point(cameras)
-    setting = Setting(shown, source.rotation_to("y"), focus, float(seconds), source.background)
-    gaussians = source.method.moving()
-    order, moving = rows_in_file(gaussians)
-    facts = {"particles": len(order), "moving": moving, "quality": quality, "seconds": seconds}
-    return write(gaussians, setting, quality), facts | {"colors": "sRGB, as in the images"}
+    gaussians, cameras = source.method.moving().to("cpu"), list(source.cameras)
+    shown = seen_in_images(gaussians, source, progress) if quality == COMPACT else None
+    order, moving = rows_in_file(gaussians, shown)
+    if not len(order):
+        raise ValueError("run: expected particles that can be seen, but got none; train it longer")
+    views = [cameras[0], *(cameras[i] for i in spread(len(cameras), _CAMERAS))]
+    setting = Setting(views, source.rotation_to("y"), focus_point(cameras), float(seconds), source.background)
+    facts = {"particles": len(order), "moving": moving, "left out": len(gaussians.means) - len(order)}
+    facts |= {"quality": quality, "seconds": seconds, "colors": "sRGB, as in the images"}
+    return write(gaussians, setting, quality, order, moving), facts
+
+
+def seen_in_images(gaussians: MovingGaussians, source: Source, progress: Progress) -> Tensor | None:
+    """Return which particles (N,) make up a quarter of a pixel of any training image; None without kernels.
+
+    Cost: each training image is rendered, with gradients.
+    """
+    if not has_kernels(gaussians.device):
+        return None
+    most = torch.zeros(len(gaussians.means))
+    views = sorted(zip(source.image_times, source.cameras), key=lambda view: view[0])
+    for done, (time, camera) in enumerate(views, 1):
+        most = torch.maximum(most, gaussians.at(Moment(time)).pixels(camera))
+        progress(done, len(views))
+    return most >= _LEAST_PIXELS if views else None

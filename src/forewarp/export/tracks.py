@@ -40,7 +40,8 @@ def no_progress(done: int, total: int) -> None:
 @dataclass(frozen=True)
 class Source:
     """A fitted ``module``, named ``model`` in its config, the ``cameras`` it was trained with, ``times`` in
-    [0, 1], the ``background`` (3,) in [0, 1] of its images, and the ``name`` of the scene.
+    [0, 1], the ``background`` (3,) in [0, 1] of its images, the ``name`` of the scene and, if known, when each
+    camera took its image.
     """
 
     module: DynamicSceneModule
@@ -49,6 +50,7 @@ class Source:
     times: Sequence[float]
     background: tuple[float, float, float] = (1.0, 1.0, 1.0)
     name: str = "scene"
+    image_times: Sequence[float] = ()
 
     @property
     def method(self) -> Method:

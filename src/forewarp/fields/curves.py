@@ -53,7 +53,20 @@ class Curve:
             self.count = max(1, min(count, times - 1))
         else:
             self.count = max(min(times, 4), count - 2) if straight else max(4, count)
-        self.pieces = self.count - (1 if self.straight else 3)  # cubics of a spline, each between two knots
+
+    @classmethod
+    def exactly(
+        cls, kind: str, count: int, times: int, canonical_time: float, *, straight: bool = False
+    ) -> Curve:
+        """Make a curve of ``count`` coefficients, as a file says."""
+        curve = cls(kind, count, times, canonical_time, straight=straight)
+        curve.count = count
+        return curve
+
+    @property
+    def pieces(self) -> int:
+        """How many cubics a spline has, each between two knots."""
+        return self.count - (1 if self.straight else 3)
 
     def __call__(self, time: float | Tensor, beyond: float = 0.0) -> Tensor:
         """The basis (..., K) at a time in [0, 1]; a spline also takes times up to ``beyond`` outside."""

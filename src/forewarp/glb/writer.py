@@ -46,21 +46,23 @@ class Setting:
     background: tuple[float, float, float]
 
 
-def write(gaussians: MovingGaussians, setting: Setting, quality: str) -> bytes:
+def write(
+    gaussians: MovingGaussians, setting: Setting, quality: str, order: np.ndarray, moving: int
+) -> bytes:
     """Return the file.
 
     Args:
-        gaussians: those whose opacity is ever seen are written, in the order of ``rows_in_file``.
+        gaussians: on the CPU.
         setting: what else is in the file.
         quality: ``compact``: rounded to what an eye can tell; ``lossless``: float32.
+        order, moving: of ``rows_in_file``.
     """
-    order, moving = rows_in_file(gaussians)
     store = _Store(compact=quality == COMPACT)
     buffer, steps = store.buffer, _Steps.of(gaussians, setting)
     attributes = _attributes(store, steps, gaussians, order)
     motion = {"version": FORMAT, "features": [], "canonicalTime": gaussians.canonical_time}
     motion |= _setting(setting, gaussians) | _over_time(store, steps, gaussians, order) | {"moving": moving}
-    if gaussians.motion is not None:
+    if moving:
         motion |= _motion(store, steps, gaussians.motion, order[:moving])
     splats = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display", "projection": "perspective"}
     splats |= {"sortingMethod": "cameraDistance", "extensions": {MOTION: motion}}
@@ -125,18 +127,18 @@ def _setting(setting: Setting, gaussians: MovingGaussians) -> dict:
     }
 
 
-def rows_in_file(gaussians: MovingGaussians) -> tuple[np.ndarray, int]:
+def rows_in_file(gaussians: MovingGaussians, shown: Tensor | None = None) -> tuple[np.ndarray, int]:
     """Return the rows that are written, in order, and how many of them move.
 
-    Those that are never more opaque than the cutoff are left out; those that move come first; those near each
-    other lie near each other.
+    Those that are never more opaque than the cutoff are left out, as are those that are not ``shown`` (N,)
+    bool; those that move come first; those near each other lie near each other.
     """
     logits = gaussians.opacity
     if gaussians.opacity_over_time is not None:
-        times = torch.linspace(0, 1, _TIMES + 1)
-        bases = gaussians.cosines(times, gaussians.opacity_over_time.shape[1])
+        bases = torch.stack([gaussians.bases(i / _TIMES)[1] for i in range(_TIMES + 1)])
         logits = (logits + bases @ gaussians.opacity_over_time.T).amax(0)
-    seen = (torch.nn.functional.logsigmoid(logits) > LEAST_LOG).numpy()
+    seen = torch.nn.functional.logsigmoid(logits) > LEAST_LOG
+    seen = (seen if shown is None else seen & shown).numpy()
     rests = np.ones(len(seen), bool)
     if gaussians.motion is not None:
         rests = ~(gaussians.motion.weights > 0).any(-1).numpy()
@@ -167,9 +169,10 @@ class _Store:
         """Store numbers in steps of the power of two at or below ``step``."""
         return self._exponential(values, math.floor(math.log2(step)), **options)
 
-    def scaled(self, values: np.ndarray, bits: int, **options) -> int:
-        """Store numbers > 0 with ``bits`` of their own mantissa each."""
+    def scaled(self, values: np.ndarray, bits: int, step: float, **options) -> int:
+        """Store numbers >= 0 with ``bits`` of their own mantissa each, or by ``step`` if that is coarser."""
         exponents = np.frexp(np.maximum(values, 2.0**meshopt.LEAST_EXPONENT))[1] - bits
+        exponents = np.maximum(exponents, math.floor(math.log2(step)))
         return self._exponential(values, exponents, **options)
 
     def _exponential(self, values: np.ndarray, exponents: np.ndarray | int, **options) -> int:
@@ -196,22 +199,35 @@ class _Store:
 
 @dataclass(frozen=True)
 class _Steps:
-    """How finely compact files store: ``length`` and ``curve`` in world units, others as they are."""
+    """How finely compact files store (docs/exports.md says what that costs).
+
+    Attributes:
+        length: of positions; world units, as are the next two.
+        curve: of nodes' translations.
+        scale: of standard deviations, or ``scale_bits`` of their own, whichever is coarser.
+        gibbs: of nodes' rotations.
+        color, harmonic: of coefficients of the constant harmonic, and of others.
+        tint: of colours over time.
+        logit: of opacity over time.
+        rotation_bits: of a component of a rotation.
+    """
 
     length: float
     curve: float
+    scale: float
+    scale_bits: int = 6
     gibbs: float = 2**-11
     color: float = 2**-7
     harmonic: float = 2**-6
+    tint: float = 2**-7
     logit: float = 2**-5
-    scale_bits: int = 6
     rotation_bits: int = 8
 
     @classmethod
     def of(cls, gaussians: MovingGaussians, setting: Setting) -> _Steps:
         """Choose lengths as shares of what a pixel of the cameras spans."""
         pixel = _pixel(gaussians, setting.cameras)
-        return cls(length=pixel / 4, curve=pixel / 8)
+        return cls(length=pixel / 16, curve=pixel / 8, scale=pixel / 16)
 
 
 def _pixel(gaussians: MovingGaussians, cameras: Sequence[Camera]) -> float:
@@ -227,12 +243,15 @@ def _attributes(store: _Store, steps: _Steps, gaussians: MovingGaussians, order:
     """Store the canonical state as KHR_gaussian_splatting has it."""
     rows = torch.from_numpy(order)
     quaternions = _unit(gaussians.quaternions[rows].double())
+    scales = gaussians.log_scales[rows].exp().numpy()
+    if store.compact:
+        quaternions, scales = _sorted_axes(quaternions, scales)
     opacity = torch.sigmoid(gaussians.opacity[rows].double()).numpy()
-    scales, vertices = gaussians.log_scales[rows].exp().numpy(), {"vertices": True}
+    vertices = {"vertices": True}
     attributes = {
         "POSITION": store.stepped(gaussians.means[rows].numpy(), steps.length, bounds=True, **vertices),
         f"{SPLATS}:ROTATION": store.quaternions(quaternions, steps.rotation_bits, **vertices),
-        f"{SPLATS}:SCALE": store.scaled(scales, steps.scale_bits, **vertices),
+        f"{SPLATS}:SCALE": store.scaled(scales, steps.scale_bits, steps.scale, **vertices),
         f"{SPLATS}:OPACITY": store.shares(opacity, **vertices),
     }
     for number, harmonic in enumerate(gaussians.harmonics[rows].unbind(1)):
@@ -250,12 +269,29 @@ def _unit(quaternions: Tensor) -> np.ndarray:
     return torch.where(length > 1e-12, quaternions / length.clamp(min=1e-12), identity).roll(-1, -1).numpy()
 
 
+def _sorted_axes(quaternions: np.ndarray, scales: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Name the axes of Gaussians anew: the longest first, turned by less than half a turn.
+
+    Half turns about an axis change nothing; of the four rotations that differ by these the one whose w is the
+    largest component is taken. Neighbours in the file are then more alike.
+    """
+    from scipy.spatial.transform import Rotation
+
+    order = np.argsort(-scales, 1, kind="stable")
+    axes = np.take_along_axis(Rotation.from_quat(quaternions).as_matrix(), order[:, None], 2)
+    axes[:, :, 2] *= np.linalg.det(axes)[:, None]
+    rotations = Rotation.from_matrix(axes)
+    largest = np.abs(rotations.as_quat()).argmax(1)  # x, y, z: half a turn about that axis brings it to w
+    turned = rotations * Rotation.from_quat(np.eye(4)[largest])
+    return turned.as_quat(canonical=True), np.take_along_axis(scales, order, 1)
+
+
 def _over_time(store: _Store, steps: _Steps, gaussians: MovingGaussians, order: np.ndarray) -> dict:
     """Store what time adds to colours and opacity, and the logits it adds to, which 8 bits do not tell."""
     parts = {}
     if gaussians.color_over_time is not None:
         colors = gaussians.color_over_time[order].unbind(1)
-        parts["colorOverTime"] = [store.stepped(color.numpy(), steps.color) for color in colors]
+        parts["colorOverTime"] = [store.stepped(color.numpy(), steps.tint) for color in colors]
     if gaussians.opacity_over_time is not None:
         logits = gaussians.opacity_over_time[order].unbind(1)
         parts["opacityLogits"] = store.stepped(gaussians.opacity[order].numpy(), steps.logit)
@@ -278,7 +314,10 @@ def _motion(store: _Store, steps: _Steps, motion: NodeMotion, rows: np.ndarray) 
         parts["timeOffsets"] = {
             name: store.buffer.add(np.array(numbers, np.float32)) for name, numbers in pair.items()
         }
-    links, weights = _slots(motion.links.numpy()[rows], motion.weights.numpy()[rows])
+    links, weights = motion.links.numpy()[rows], motion.weights.numpy()[rows]
+    if store.compact:  # whoever reads them divides by their sum
+        weights = np.rint(weights / weights.max(1, keepdims=True) * UNIT_BYTE.one) / UNIT_BYTE.one
+    links, weights = _slots(links, weights)
     component = BYTE if len(motion.positions) <= 256 else SHORT
     for name, table, add in (
         ("links", links, lambda part: store.buffer.add(part, component)),
@@ -289,6 +328,26 @@ def _motion(store: _Store, steps: _Steps, motion: NodeMotion, rows: np.ndarray) 
 
 
 def _slots(links: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return links and weights (N, S), S a multiple of 4: those that are left over are 0."""
-    width = ((0, 0), (0, -links.shape[1] % _SLOTS))
-    return np.pad(np.where(weights > 0, links, 0), width), np.pad(weights, width)
+    """Return links and weights (N, S), S a multiple of 4: a node stays in its column from row to row.
+
+    A column whose node a row does not follow has the weight 0 and keeps its node; the one that was not used
+    for longest takes a new node.
+    """
+    count = len(links)
+    width = -(-links.shape[1] // _SLOTS) * _SLOTS
+    made, shares = np.zeros((count, width), links.dtype), np.zeros((count, width), weights.dtype)
+    held, used = [0] * width, [0] * width
+    for row, (nodes, parts) in enumerate(zip(links.tolist(), weights.tolist()), 1):
+        free = []
+        for node, part in zip(nodes, parts):
+            if part > 0:
+                column = held.index(node) if node in held else -1
+                if column < 0 or used[column] == row:
+                    free.append((node, part))
+                else:
+                    used[column], shares[row - 1, column] = row, part
+        for node, part in free:
+            column = used.index(min(used))
+            held[column], used[column], shares[row - 1, column] = node, row, part
+        made[row - 1] = held
+    return made, shares

@@ -1,13 +1,14 @@
-"""A fitted run: open it as an object, measure it, score it for a sweep, and say what speaks against it."""
+"""A fitted run: open it, or a scene's file, as an object; measure, score and doubt it."""
 
 from __future__ import annotations
 
 import math
 import sys
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from statistics import fmean
+from typing import ClassVar
 
 import torch
 from hydra.core.hydra_config import HydraConfig
@@ -20,7 +21,9 @@ from torch import Tensor
 from forewarp.data.batches import color_of
 from forewarp.data.checks import blind_frames, bounds
 from forewarp.evaluation.evaluate import evaluate, mean_scores, show
+from forewarp.fields.moving import GaussiansSnapshot, MovingGaussians
 from forewarp.files import read_json, write_json
+from forewarp.glb.reader import read
 from forewarp.methods.method import HasMatter, HasTrajectories, Method, Snapshot
 from forewarp.metrics.lpips import find_lpips, find_lpips_weights
 from forewarp.metrics.registry import METRICS, NETS, ImageSuite
@@ -39,8 +42,58 @@ from forewarp.training.stages import Run
 SPLITS = ("train", "val", "test", "held")
 
 
+class Renderable:
+    """What a fitted scene is asked for, wherever it comes from.
+
+    Attributes:
+        method: renders and moves points.
+        name: of the method, for errors.
+    """
+
+    method: Method | MovingGaussians
+    name: str
+    _snapshot: Snapshot | GaussiansSnapshot | None = None
+
+    def render(self, camera: Camera, time: float, background: str | Tensor = "white") -> Tensor:
+        """Render the scene from a camera at a time: a picture (H, W, 3) in [0, 1], on the CPU.
+
+        Args:
+            camera: ``frame.camera``, or one of your own; ``camera.resized(w, h)`` changes the size.
+            time: time in [0, 1].
+            background: white, black, or a colour (3,) in [0, 1].
+
+        Cost: consecutive pictures of one time share one snapshot.
+        """
+        if not 0 <= time <= 1:
+            raise ValueError(f"time: expected a number in [0, 1], but got {time}")
+        behind = color_of(background) if isinstance(background, str) else background
+        moment = Moment(float(time))
+        with torch.no_grad():
+            if self._snapshot is None or not self._snapshot.holds(moment):
+                self._snapshot = self.method.at(moment)
+            drawn = self._snapshot.render(View(camera), behind.to(self.method.device))
+        return drawn.rgb.clamp(0, 1).reshape(camera.height, camera.width, 3).cpu()
+
+    def trajectories(self, points: Tensor, times: Sequence[float]) -> Tensor:
+        """Follow canonical points (N, 3), world units, to ``times`` (T,) in [0, 1]; return (N, T, 3)."""
+        method = self._able(HasTrajectories, "follows points")
+        with torch.no_grad():
+            at = torch.as_tensor(times, dtype=torch.float32, device=method.device)
+            return method.trajectories(points.to(method.device), at).cpu()
+
+    def matter(self) -> Cloud:
+        """Return the canonical matter as points with colour and opacity."""
+        with torch.no_grad():
+            return self._able(HasMatter, "tells where matter is").matter()
+
+    def _able(self, ability: type, what: str) -> Method | MovingGaussians:
+        if not isinstance(self.method, ability):
+            raise ValueError(f"model: expected a method that {what}, but got {self.name}")
+        return self.method
+
+
 @dataclass
-class Fitted:
+class Fitted(Renderable):
     """A fitted scene, as ``forewarp.load(folder)`` returns it.
 
     >>> import forewarp
@@ -66,12 +119,16 @@ class Fitted:
     config: DictConfig
     module: DynamicSceneModule
     scene: Scene
-    _snapshot: Snapshot | None = field(default=None, repr=False)
 
     @property
     def method(self) -> Method:
         """The fitted method."""
         return self.module.method
+
+    @property
+    def name(self) -> str:
+        """The method's name in the config."""
+        return self.config.model.name
 
     @property
     def metrics(self) -> dict:
@@ -84,42 +141,38 @@ class Fitted:
             raise ValueError(f"split: expected one of {', '.join(SPLITS)}, but got {split!r}")
         return getattr(self.scene, split)
 
-    def render(self, camera: Camera, time: float, background: str | Tensor = "white") -> Tensor:
-        """Render the scene from a camera at a time: a picture (H, W, 3) in [0, 1], on the CPU.
 
-        Args:
-            camera: ``frame.camera``, or one of your own; ``camera.resized(w, h)`` changes the size.
-            time: time in [0, 1].
-            background: white, black, or a colour (3,) in [0, 1].
+@dataclass
+class SceneFile(Renderable):
+    """A scene of particles in one file, as ``forewarp.load("scene.glb")`` returns it; no run is needed.
 
-        Cost: consecutive pictures of one time share one snapshot.
-        """
-        if not 0 <= time <= 1:
-            raise ValueError(f"time: expected a number in [0, 1], but got {time}")
-        behind = color_of(background) if isinstance(background, str) else background
-        moment = Moment(float(time))
-        with torch.no_grad():
-            if self._snapshot is None or not self._snapshot.holds(moment):
-                self._snapshot = self.method.at(moment)
-            drawn = self._snapshot.render(View(camera), behind.to(self.module.device))
-        return drawn.rgb.clamp(0, 1).reshape(camera.height, camera.width, 3).cpu()
+    Attributes:
+        file: the file.
+        gaussians: all that it holds, moving; ``scene.gaussians.ellipsoids(0.5)`` are they at a time.
+        cameras: some of those that the scene was fitted to; a page begins at the first.
+        background: (3,), of the images.
+        seconds: how long time lasts from 0 to 1, as a player shows it.
+    """
 
-    def trajectories(self, points: Tensor, times: Sequence[float]) -> Tensor:
-        """Follow canonical points (N, 3), world units, to ``times`` (T,) in [0, 1]; return (N, T, 3)."""
-        method = self._able(HasTrajectories, "follows points")
-        with torch.no_grad():
-            at = torch.as_tensor(times, dtype=torch.float32, device=self.module.device)
-            return method.trajectories(points.to(self.module.device), at).cpu()
+    file: Path
+    gaussians: MovingGaussians
+    cameras: list[Camera]
+    background: Tensor
+    seconds: float
+    name: ClassVar[str] = "particles"
 
-    def matter(self) -> Cloud:
-        """Return the canonical matter as points with colour and opacity."""
-        with torch.no_grad():
-            return self._able(HasMatter, "tells where matter is").matter()
+    @property
+    def method(self) -> MovingGaussians:
+        """What renders and moves points."""
+        return self.gaussians
 
-    def _able(self, ability: type, what: str) -> Method:
-        if not isinstance(self.method, ability):
-            raise ValueError(f"model: expected a method that {what}, but got {self.config.model.name}")
-        return self.method
+
+def open_file(file: Path, device: str = "cpu") -> SceneFile:
+    """Open a ``scene.glb``; see ``forewarp.load``."""
+    held = read(file)
+    setting, gaussians = held.setting, held.gaussians.to(device)
+    background = torch.tensor(setting.background)
+    return SceneFile(file, gaussians, list(setting.cameras), background, setting.seconds)
 
 
 def opened(config: DictConfig, device: str | torch.device | None = None) -> tuple[Run, DynamicSceneModule]:
@@ -141,8 +194,10 @@ def opened(config: DictConfig, device: str | torch.device | None = None) -> tupl
     return run, module.eval()
 
 
-def open_run(run: str | Path, *, trust: Sequence[str] | str = (), device: str = "cpu") -> Fitted:
-    """Load a finished run from its folder; see ``forewarp.load``."""
+def open_run(run: str | Path, *, trust: Sequence[str] | str = (), device: str = "cpu") -> Fitted | SceneFile:
+    """Load a finished run from its folder, or a scene from a file; see ``forewarp.load``."""
+    if Path(run).suffix == ".glb" or Path(run).is_file():
+        return open_file(Path(run), device)
     config = saved_config(str(run), OmegaConf.create({"trust": list(trust_of(trust))}))
     made, module = opened(config, device)
     return Fitted(Path(run), config, module, made.datamodule.scene)

@@ -50,6 +50,28 @@ def far_apart(points: Tensor, count: int) -> Tensor:
     return torch.tensor(chosen, device=points.device)
 
 
+def nearest(points: Tensor, positions: Tensor, count: int) -> tuple[Tensor, Tensor]:
+    """Find the positions (M, 3) nearest to points (N, 3).
+
+    Returns:
+        squared distances and rows (N, count), nearest first; fewer where there are fewer positions.
+
+    Raises:
+        ValueError: for points or positions that are not finite.
+
+    Cost: a tree of the positions, on the CPU, and a walk down it for each point.
+    """
+    from scipy.spatial import KDTree  # late, as its import takes time
+
+    ranks = list(range(1, min(count, len(positions)) + 1))
+    if not len(points):
+        none = points.new_zeros(0, len(ranks))
+        return none, none.long()
+    tree = KDTree(positions.detach().double().cpu().numpy())
+    distances, rows = tree.query(points.detach().double().cpu().numpy(), ranks)
+    return torch.from_numpy(distances).square().to(points), torch.from_numpy(rows).to(points.device)
+
+
 @dataclass(frozen=True)
 class Handover:
     """What a fitted stage passes on to the next stage, whatever their methods.

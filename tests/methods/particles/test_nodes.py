@@ -4,8 +4,9 @@ import pytest
 import torch
 
 from forewarp.fields.curves import Curve
-from forewarp.methods.particles.nodes import Nodes, Skinning, TimeOffsets, nearest
+from forewarp.methods.particles.nodes import Nodes, Skinning, TimeOffsets
 from forewarp.methods.rows import RowsAdam
+from forewarp.scene.cloud import nearest
 from tests.support.particles import module_with, small_data
 
 TIMES = [0.0, 0.25, 0.5, 0.75, 1.0]

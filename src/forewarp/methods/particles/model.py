@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
-from functools import lru_cache, partial
+from functools import partial
 from typing import Any, ClassVar
 
 import torch
 from torch import Tensor, nn
 
 from forewarp.fields.curves import Curve
-from forewarp.fields.moving import MARGIN, nearest_shown
+from forewarp.fields.moving import GaussiansSnapshot, cosines, pinhole_of
 from forewarp.losses import IMAGE_LOSSES, robust
 from forewarp.methods.method import Method, Snapshot, Start, Step
 from forewarp.methods.particles import density, queries
@@ -30,24 +29,16 @@ from forewarp.ops.backend import has_kernels
 from forewarp.ops.gaussians import (
     BLUR,
     FEASIBLE,
-    FLAT,
     Gaussians,
-    Pinhole,
     Warp,
     compare,
-    project,
-    rasterize,
     smaller,
 )
 from forewarp.ops.nodes import pull_nodes
-from forewarp.scene.camera import Camera
 from forewarp.scene.cloud import Cloud
 from forewarp.scene.frame import Scene, spread
-from forewarp.scene.view import Asks, Batch, Moment, Observation, Rendering, View
+from forewarp.scene.view import Asks, Batch, Moment, Observation
 
-_LENS_MARGIN = 1.3  # of the squared distance from the axis that the image's border reaches
-_BORDER = 16  # points along each side of an image
-_TRANSPARENT = 1e-6  # opacity below which a pixel has no depth
 _FEWEST_TIMES = 8  # of training, for learned corrections of them
 _COUNTED_IMAGES = 12  # whose covered pixels are counted before a run
 _SLACK = 0.98  # of a side, as smaller images are not covered to exactly the same share
@@ -56,88 +47,8 @@ _ROWS = ("means", "scales", "quaternions", "opacity", "colors", "sh", "color_ove
 _ROWS += ("gradient_sum", "image_count", "unseen_rounds", "resting")
 
 
-@lru_cache(maxsize=4096)
-def pinhole_of(camera: Camera, blur: float) -> Pinhole:
-    """Convert a scene's camera to what the operators read; each camera once, as it takes 0.3 ms.
-
-    Args:
-        camera: a camera, with or without a lens.
-        blur: square pixels added to the variance of every splat.
-    """
-    pose, lens = camera.camera_to_world.double(), camera.lens
-    return Pinhole(
-        tuple(pose[:3, :3].T.flatten().tolist()),
-        tuple(pose[:3, 3].tolist()),
-        (camera.fx, camera.fy),
-        (camera.cx, camera.cy),
-        (camera.width, camera.height),
-        nearest_shown(camera),
-        skew=camera.skew,
-        blur=blur,
-        margin=MARGIN * max(camera.width, camera.height),
-        radial=(0.0, 0.0, 0.0) if lens is None else lens.k,
-        tangential=(0.0, 0.0) if lens is None else lens.p,
-        reach=1e8 if lens is None else _squared_reach(camera),
-    )
-
-
-def _squared_reach(camera: Camera) -> float:
-    """Return the squared distance from the axis, at depth 1, up to which a lens may show points.
-
-    Beyond it the lens's polynomial may fold points back into the image.
-    """
-    along = torch.linspace(0, 1, _BORDER, dtype=torch.float64)
-    across, down = along * camera.width, along * camera.height
-    zero = torch.zeros_like(along)
-    u = torch.cat([across, across, zero, zero + camera.width])
-    v = torch.cat([zero, zero + camera.height, down, down])
-    y = (v - camera.cy) / camera.fy
-    x = (u - camera.cx - camera.skew * y) / camera.fx
-    return _LENS_MARGIN * float(camera.lens.straighten(torch.stack([x, y], -1)).square().sum(-1).max())
-
-
-@dataclass(eq=False)
-class ParticlesSnapshot(Snapshot):
-    """Particles at a moment.
-
-    Attributes:
-        moment: the moment.
-        gaussians: the canonical particles.
-        warp: how they move until then.
-        color_basis, opacity_basis: what the time makes of colours (T,) and of opacity (F,).
-        blur: square pixels added to the variance of every splat.
-    """
-
-    moment: Moment
-    gaussians: Gaussians
-    warp: Warp
-    color_basis: Tensor
-    opacity_basis: Tensor
-    blur: float
-
-    def render(self, view: View, background: Tensor, rendering: str | None = None) -> Rendering:
-        """See ``Snapshot``. Pixels and crops are taken from the whole image, which costs little."""
-        pinhole = pinhole_of(view.camera, self.blur)
-        splats = project(self.gaussians, self.warp, pinhole, self.color_basis, self.opacity_basis)
-        color, distance, through = rasterize(splats, *pinhole.size)
-        color, distance, through = color.reshape(3, -1).T, distance.reshape(-1), through.reshape(-1)
-        if view.indices is not None:
-            rows = view.indices.to(color.device)
-            color, distance, through = color[rows], distance[rows], through[rows]
-        opacity = 1 - through
-        depth = torch.where(opacity > _TRANSPARENT, distance / opacity.clamp(min=_TRANSPARENT), 0.0)
-        return Rendering(color + through[:, None] * background.to(color), depth, opacity)
-
-    def share(self, view: View, rows: Tensor) -> Tensor:
-        """See ``HasShares``: render these particles white, all others black."""
-        flat = torch.where(rows, 0.5, -0.5).to(self.gaussians.colors)[:, None, None] / FLAT
-        painted = self.gaussians._replace(colors=flat.expand(-1, 1, 3).contiguous())
-        plain = replace(self, gaussians=painted, color_basis=self.color_basis[:0])
-        return plain.render(view, flat.new_zeros(3)).rgb[:, 0]
-
-    def holds(self, moment: Moment) -> bool:
-        """Return whether it is the same time; which camera looks does not matter."""
-        return moment.time == self.moment.time
+class ParticlesSnapshot(GaussiansSnapshot, Snapshot):
+    """Particles at a moment."""
 
 
 class Particles(Method):
@@ -350,10 +261,7 @@ class Particles(Method):
 
     def _cosines(self, count: int, time: float) -> list[float]:
         """Return ``cos(pi k t) - cos(pi k t_c)`` for k = 1 .. count: 0 at the canonical time."""
-        return [
-            math.cos(math.pi * k * time) - math.cos(math.pi * k * self.canonical_time)
-            for k in range(1, count + 1)
-        ]
+        return cosines(count, time, self.canonical_time)
 
     @torch.no_grad()
     def look(self, batch: Batch, factors: Mapping[str, float], generator: torch.Generator) -> Step:

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from forewarp.fields.curves import Curve
 from forewarp.ops.nodes import carry_nodes, skin_weights, spread_nodes
-from forewarp.scene.cloud import far_apart
+from forewarp.scene.cloud import far_apart, nearest
 
 LINKS = 6  # nodes that a particle follows
 _LEAST = 1e-20  # squared distance; what is nearer together coincides, and cannot be strained
@@ -20,28 +20,6 @@ _FULL = 0.05  # share of a spline's basis at a time, from which on its knot coun
 _FARTHEST = 0.2  # of all time: no image's time is off by more
 _BEYOND = _FARTHEST + 2 * _HALF_STEP  # of all time, by which a curve must reach beyond [0, 1]
 _PULL = 0.1  # of the learning rate: by how much a step draws an offset towards 0
-
-
-def nearest(points: Tensor, positions: Tensor, count: int) -> tuple[Tensor, Tensor]:
-    """Find the positions (M, 3) nearest to points (N, 3).
-
-    Returns:
-        squared distances and rows (N, count), nearest first; fewer where there are fewer positions.
-
-    Raises:
-        ValueError: for points or positions that are not finite.
-
-    Cost: a tree of the positions, on the CPU, and a walk down it for each point.
-    """
-    from scipy.spatial import KDTree  # late, as its import takes time
-
-    ranks = list(range(1, min(count, len(positions)) + 1))
-    if not len(points):
-        none = points.new_zeros(0, len(ranks))
-        return none, none.long()
-    tree = KDTree(positions.detach().double().cpu().numpy())
-    distances, rows = tree.query(points.detach().double().cpu().numpy(), ranks)
-    return torch.from_numpy(distances).square().to(points), torch.from_numpy(rows).to(points.device)
 
 
 class TimeOffsets(nn.Module):

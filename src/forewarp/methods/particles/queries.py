@@ -15,91 +15,20 @@ from torch import Tensor
 
 from forewarp.fields.moving import MovingGaussians, NodeMotion
 from forewarp.methods.particles.density import most_opaque
-from forewarp.methods.particles.nodes import nearest
 from forewarp.methods.rows import keep_rows
-from forewarp.ops.gaussians import FLAT, Warp, moved, rotations
+from forewarp.ops.gaussians import moved
 from forewarp.scene.box import Box
 from forewarp.scene.camera import Camera
-from forewarp.scene.cloud import Cloud, Ellipsoids
+from forewarp.scene.cloud import Cloud, Ellipsoids, nearest
 from forewarp.scene.frame import Frame, spread
 
 if TYPE_CHECKING:
     from forewarp.methods.particles.model import Particles
 
-_SOLID, _VISIBLE = 0.1, 0.02  # opacity from which matter bounds the scene; from which there is any
-_NEIGHBOURS = 4  # particles that a point goes with
+_SOLID = 0.1  # opacity from which matter bounds the scene
 _FRAMES, _CAMERAS = 32, 8  # at whose times, and from which of them, motion is looked at
 _MOVES = 1.5  # pixels from the mean place, from which on it is seen that a particle moves
 _ALIKE = 9  # particles beside each other, whose median counts
-_COLLAPSED = 0.05  # of the longest axis: what a blend of maps has pressed flatter is not stretched again
-
-
-def _visible(particles: Particles) -> Tensor:
-    """Return which particles (N,) there is anything to see of; all, if there is of none."""
-    visible = torch.sigmoid(particles.opacity.data[:, 0]) > _VISIBLE
-    return visible if bool(visible.any()) else torch.ones_like(visible)
-
-
-@torch.no_grad()
-def matter(self: Particles) -> Cloud:
-    """See ``HasMatter``: the particles of which there is anything to see, at the canonical time."""
-    keep = _visible(self)
-    points = moved(self.means.data, self.warp(self.canonical_time))[0]
-    colors = (0.5 + FLAT * self.colors.data[keep, 0]).clamp(0, 1)
-    size = 2 * float(self.scales.exp().mean())
-    return Cloud(points[keep], colors, torch.sigmoid(self.opacity.data[keep, 0]), max(size, 1e-9))
-
-
-@torch.no_grad()
-def ellipsoids(self: Particles, time: float) -> Ellipsoids:
-    """See ``HasEllipsoids``: all particles, also those at rest and those that have faded."""
-    canonical = template(self)
-    centers, linear = moved(canonical.centers, self.warp(time))
-    color_basis, opacity_basis = self.time_bases(time)
-    harmonics, opacity = canonical.harmonics, self.opacity[:, 0]
-    if self.color_over_time is not None:
-        harmonics = harmonics.clone()
-        harmonics[:, 0] += torch.einsum("t,ntc->nc", color_basis, self.color_over_time) / FLAT
-    if self.opacity_over_time is not None:
-        opacity = opacity + self.opacity_over_time @ opacity_basis[1:]
-    return Ellipsoids(centers, linear @ canonical.roots, torch.sigmoid(opacity), harmonics)
-
-
-@torch.no_grad()
-def template(self: Particles) -> Ellipsoids:
-    """See ``HasEllipsoids``: before any motion; nodes move it a little at the canonical time, too."""
-    roots = rotations(self.quaternions) * self.scales.exp()[:, None]
-    harmonics = self.colors if self.sh is None else torch.cat([self.colors, self.sh], 1)
-    return Ellipsoids(self.means.data, roots, torch.sigmoid(self.opacity[:, 0]), harmonics.data)
-
-
-@torch.no_grad()
-def movement(self: Particles, times: Sequence[float]) -> dict[str, Tensor]:
-    """See ``HasEllipsoids``. A center goes to ``x + sum_l w_l (D x + d)``, a root to ``(I + sum_l w_l D)
-    root``, where l are the nodes in ``links`` (N, L), w ``weights`` (N, L) and ``D | d`` the nodes' ``maps``
-    (T, M, 3, 4). ``color_over_time`` (N, K, 3), by ``color_basis`` (T, K), is added to the colour, and
-    ``opacity_over_time`` (N, F), by ``opacity_basis`` (T, F), to the opacity's logit. The maps come of
-    ``node_shift`` and ``node_turn`` (M, B, 3), by ``node_basis`` (T, B), about ``node_places`` (M, 3).
-    What is off is absent.
-    """
-    parts = {}
-    if self.nodes is not None:
-        nodes, warps = self.nodes, [self.warp(time) for time in times]
-        maps = [torch.cat([w.maps[:, :9].reshape(-1, 3, 3), w.maps[:, 9:, None]], -1) for w in warps]
-        parts = {"links": warps[0].links, "weights": warps[0].weights, "maps": torch.stack(maps)}
-        parts |= {"node_places": nodes.positions, "node_shift": nodes.translations}
-        parts["node_basis"] = torch.stack([nodes.basis(time) for time in times])
-        if nodes.rotations is not None:
-            parts["node_turn"] = nodes.rotations
-    if self.color_over_time is not None:
-        parts["color_over_time"] = self.color_over_time
-        parts["color_basis"] = self.color_over_time.new_tensor([self.color_basis(time) for time in times])
-    if self.opacity_over_time is not None:
-        parts["opacity_over_time"] = self.opacity_over_time
-        parts["opacity_basis"] = self.opacity_over_time.new_tensor(
-            [self.opacity_basis(time) for time in times]
-        )
-    return {name: value.detach() for name, value in parts.items()}
 
 
 @torch.no_grad()
@@ -121,7 +50,8 @@ def moving(self: Particles) -> MovingGaussians:
         )
     over_time = (self.color_over_time, self.opacity_over_time)
     over_time = [None if part is None else part.data for part in over_time]
-    harmonics, opacity = template(self).harmonics, self.opacity.data[:, 0]
+    harmonics = self.colors if self.sh is None else torch.cat([self.colors, self.sh], 1)
+    opacity, harmonics = self.opacity.data[:, 0], harmonics.data
     canonical = self.means.data, self.scales.data, self.quaternions.data, opacity, harmonics
     return MovingGaussians(*canonical, *over_time, self.canonical_time, self.blur, motion)
 
@@ -178,33 +108,26 @@ def bounds(self: Particles, times: list[float]) -> Box | None:
     return Box(tuple(low.tolist()), tuple(high.tolist()))
 
 
-@torch.no_grad()
+def matter(self: Particles) -> Cloud:
+    """See ``HasMatter``."""
+    return self.moving().matter()
+
+
 def trajectories(self: Particles, points: Tensor, times: Tensor) -> Tensor:
-    """Return where points (P, 3) of the canonical time are at times (T,): (P, T, 3).
+    """See ``HasTrajectories``."""
+    return self.moving().trajectories(points, times)
 
-    A particle takes a point from where it was beside it then, ``F_t F_c^-1 (y - x_c) + x_t``; those that were
-    nearest then are blended by ``1 / d^2``. At the canonical time that is y itself, unless a blend has
-    pressed a particle flat.
 
-    Cost: a search among the particles, and all of them moved once for each time.
-    """
-    if self.nodes is None:
-        return points[:, None].expand(-1, len(times), -1).clone()
-    keep = _visible(self)
-    means, links, weights = self.means.data[keep], self.skinning.links[keep], self.skinning.weights()[keep]
+def ellipsoids(self: Particles, time: float) -> Ellipsoids:
+    """See ``HasEllipsoids``."""
+    return self.moving().ellipsoids(time)
 
-    def at(time: float) -> tuple[Tensor, Tensor]:
-        return moved(means, Warp(self.nodes.maps(time), links, weights))
 
-    canonical, linear = at(self.canonical_time)
-    points = points.to(canonical)
-    squared, rows = nearest(points, canonical, _NEIGHBOURS)
-    shares = 1 / (squared + 1e-6 * squared.mean() + 1e-30)
-    shares = (shares / shares.sum(-1, keepdim=True))[..., None]
-    inverse = torch.linalg.pinv(linear, rtol=_COLLAPSED)
-    local = (inverse[rows] @ (points[:, None] - canonical[rows])[..., None])[..., 0]
-    paths = []
-    for time in times.tolist():
-        now, linear = at(time)
-        paths.append((shares * ((linear[rows] @ local[..., None])[..., 0] + now[rows])).sum(1))
-    return torch.stack(paths, 1) if paths else points.new_zeros(len(points), 0, 3)
+def template(self: Particles) -> Ellipsoids:
+    """See ``HasEllipsoids``."""
+    return self.moving().template()
+
+
+def movement(self: Particles, times: Sequence[float]) -> dict[str, Tensor]:
+    """See ``HasEllipsoids``."""
+    return self.moving().movement(times)

@@ -17,7 +17,6 @@ import torch
 from torch import Tensor
 
 from forewarp.methods.method import Start
-from forewarp.methods.particles.nodes import nearest
 from forewarp.ops.adam import AdamState, adam_rows
 from forewarp.ops.backend import cores, use_numba
 from forewarp.ops.gaussians import (
@@ -34,7 +33,7 @@ from forewarp.ops.grid import dilate
 from forewarp.ops.nodes import carry_nodes, pull_nodes, skin_weights, spread_nodes
 from forewarp.scene.box import Box, Lattice
 from forewarp.scene.camera import Camera, Lens
-from forewarp.scene.cloud import Cloud
+from forewarp.scene.cloud import Cloud, nearest
 from forewarp.scene.frame import Frame, Scene, spread, visual_hull
 
 _FRAMES = 12  # whose silhouettes carve the hull

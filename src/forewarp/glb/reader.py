@@ -1,0 +1,433 @@
+"""Read a ``scene.glb``, from anywhere: nothing of it is trusted, and what is wrong is named in one line."""
+
+from __future__ import annotations
+
+import json
+import math
+import struct
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from forewarp.fields.curves import KINDS, PADDING, Curve
+from forewarp.fields.moving import MovingGaussians, NodeMotion
+from forewarp.files import MOST_ARRAYS
+from forewarp.glb import meshopt
+from forewarp.glb.container import CHUNKS, COMPONENTS, COMPRESSION, ELEMENTS, MAGIC, VERSION
+from forewarp.glb.writer import FORMAT, MOTION, SPLATS, Setting
+from forewarp.scene.camera import Camera, Lens
+
+_KNOWN = {COMPRESSION, SPLATS, MOTION}  # extensions that a file may require
+FEATURES: frozenset[str] = frozenset()  # names that a file may list of what a reader must know
+_DEGREES = 3  # of the harmonics, at most
+FARTHEST = 0.2  # of all time: no image's time is off by more
+_ONE_FILTER = {"NONE": None, "EXPONENTIAL": None, "QUATERNION": 8}  # the stride that a filter asks for
+
+
+class Fields:
+    """A part of the description: reads its properties, and refuses one that is missing or of another kind.
+
+    Args:
+        content: of the part.
+        place: where it is, for errors.
+    """
+
+    def __init__(self, content: Any, place: str) -> None:
+        if not isinstance(content, dict):
+            raise ValueError(f"{place}: expected an object, but got {_short(content)}")
+        self.content, self.place = content, place
+
+    def __contains__(self, key: str) -> bool:
+        return key in self.content
+
+    def _get(self, key: str, expected: str, good, default=None):
+        value = self.content.get(key, default)
+        if value is None or isinstance(value, bool) != (expected == "true or false") or not good(value):
+            got = _short(value) if key in self.content else "none"
+            raise ValueError(f"{self.place}.{key}: expected {expected}, but got {got}")
+        return value
+
+    def whole(self, key: str, least: int, most: int, default: int | None = None) -> int:
+        """Return a whole number from ``least`` to ``most``."""
+        good = lambda n: isinstance(n, int) and least <= n <= most  # noqa: E731
+        return self._get(key, f"a whole number from {least} to {most}", good, default)
+
+    def number(self, key: str, least: float, most: float, default: float | None = None) -> float:
+        """Return a number from ``least`` to ``most``."""
+        good = lambda x: isinstance(x, int | float) and least <= x <= most  # noqa: E731
+        return float(self._get(key, f"a number from {least:g} to {most:g}", good, default))
+
+    def numbers(self, key: str, count: int, default: list[float] | None = None) -> list[float]:
+        """Return ``count`` finite numbers."""
+        values = self._get(
+            key, f"{count} numbers", lambda v: isinstance(v, list) and len(v) == count, default
+        )
+        if not all(type(x) in (int, float) and abs(x) < 1e30 for x in values):
+            raise ValueError(f"{self.place}.{key}: expected {count} numbers, but got {_short(values)}")
+        return [float(x) for x in values]
+
+    def text(self, key: str, default: str | None = None) -> str:
+        """Return a text."""
+        return self._get(key, "a text", lambda v: isinstance(v, str), default)
+
+    def flag(self, key: str, default: bool) -> bool:
+        """Return true or false."""
+        return self._get(key, "true or false", lambda v: isinstance(v, bool), default)
+
+    def items(self, key: str, default: list | None = None) -> list:
+        """Return a list."""
+        return self._get(key, "a list", lambda v: isinstance(v, list), default)
+
+    def parts(self, key: str) -> list[Fields]:
+        """Return a list of parts; none if it is missing."""
+        return [Fields(part, f"{self.place}.{key}[{n}]") for n, part in enumerate(self.items(key, []))]
+
+    def part(self, key: str) -> Fields:
+        """Return a part."""
+        return Fields(self.content.get(key), f"{self.place}.{key}")
+
+
+def _short(value: Any) -> str:
+    text = repr(value)
+    return text if len(text) <= 60 else text[:57] + "..."
+
+
+class Container:
+    """A binary glTF: its ``description``, and the arrays that its accessors describe.
+
+    Args:
+        data: the whole file.
+
+    Raises:
+        ValueError: naming what is wrong.
+    """
+
+    def __init__(self, data: bytes) -> None:
+        if len(data) < 12 or data[:4] != MAGIC:
+            raise ValueError("expected a binary glTF, but got another file")
+        version, length = struct.unpack_from("<II", data, 4)
+        if version != VERSION:
+            raise ValueError(f"expected version {VERSION} of glTF, but got {version}")
+        if length != len(data):
+            raise ValueError(f"expected {length} bytes, as its header says, but got {len(data)}")
+        chunks, begin = {}, 12
+        while begin + 8 <= length:
+            size, kind = struct.unpack_from("<I4s", data, begin)
+            if begin + 8 + size > length:
+                raise ValueError(f"expected a chunk of {size} bytes, but got {length - begin - 8}")
+            chunks.setdefault(kind, memoryview(data)[begin + 8 : begin + 8 + size])
+            begin += 8 + size
+        text, binary = (chunks.get(kind) for kind in CHUNKS)
+        if text is None or binary is None:
+            raise ValueError("expected a chunk of JSON and one of arrays, but got others")
+        self.description, self.binary = Fields(_parsed(bytes(text)), "glTF"), binary
+        self.accessors, self.views = (self.description.parts(key) for key in ("accessors", "bufferViews"))
+        self._decoded: dict[int, np.ndarray] = {}
+        self._room = MOST_ARRAYS
+
+    def array(self, number: Any, kind: str, count: int | None = None, *, place: str) -> np.ndarray:
+        """Return an accessor's rows (N, 1), (N, 3) or (N, 4): whole numbers, or float32 that are finite.
+
+        Args:
+            number: of the accessor.
+            kind: ``SCALAR``, ``VEC3`` or ``VEC4``.
+            count: of its rows; None: as it says.
+            place: what asks for it, for errors.
+        """
+        if type(number) is not int or not 0 <= number < len(self.accessors):
+            raise ValueError(
+                f"{place}: expected one of {len(self.accessors)} accessors, but got {_short(number)}"
+            )
+        accessor, width = self.accessors[number], {name: n for n, name in ELEMENTS.items()}[kind]
+        rows = accessor.whole("count", 1, MOST_ARRAYS)
+        if accessor.text("type") != kind or (count is not None and rows != count):
+            wanted = f"{'rows' if count is None else count} of {kind}"
+            raise ValueError(f"{place}: expected {wanted}, but got {rows} of {accessor.text('type')}")
+        component = COMPONENTS.get(accessor.whole("componentType", 0, 2**16))
+        if component is None or "sparse" in accessor:
+            raise ValueError(f"{accessor.place}: expected plain numbers of 8, 16 or 32 bits, but got others")
+        elements, stride = self._view(accessor.whole("bufferView", 0, len(self.views) - 1))
+        dtype = np.dtype(component.dtype)
+        stride, offset = stride or width * dtype.itemsize, accessor.whole("byteOffset", 0, 2**31, 0)
+        end = offset + (rows - 1) * stride + width * dtype.itemsize
+        if stride < width * dtype.itemsize or end > len(elements):
+            raise ValueError(f"{accessor.place}: expected {end} bytes, but got {len(elements)}")
+        strides = (stride, dtype.itemsize)
+        values = np.ndarray((rows, width), dtype, elements.data, offset, strides).copy()
+        if accessor.flag("normalized", False):
+            one = np.iinfo(dtype).max if dtype.kind != "f" else 1
+            values = np.maximum(values / np.float32(one), -1).astype(np.float32)
+        if values.dtype.kind == "f" and not np.isfinite(values).all():
+            raise ValueError(f"{place}: expected finite numbers, but got others")
+        return values
+
+    def _view(self, number: int) -> tuple[np.ndarray, int]:
+        """Return the bytes (B,) uint8 of a view, decoded, and its stride; 0: none is said."""
+        view = self.views[number]
+        stride = view.whole("byteStride", 4, 252, 0) if "byteStride" in view else 0
+        if number not in self._decoded:
+            extensions = view.part("extensions") if "extensions" in view else None
+            if extensions is None or COMPRESSION not in extensions:
+                self._decoded[number] = np.frombuffer(self._bytes(view), np.uint8)
+            else:
+                self._decoded[number] = self._uncompressed(extensions.part(COMPRESSION))
+        return self._decoded[number], stride
+
+    def _bytes(self, part: Fields) -> memoryview:
+        part.whole("buffer", 0, 0)
+        begin, length = part.whole("byteOffset", 0, 2**31, 0), part.whole("byteLength", 1, 2**31)
+        if begin + length > len(self.binary):
+            raise ValueError(f"{part.place}: expected {begin + length} bytes, but got {len(self.binary)}")
+        return self.binary[begin : begin + length]
+
+    def _uncompressed(self, part: Fields) -> np.ndarray:
+        data, stride = bytes(self._bytes(part)), part.whole("byteStride", 4, 256)
+        count, mode, name = (
+            part.whole("count", 1, MOST_ARRAYS),
+            part.text("mode"),
+            part.text("filter", "NONE"),
+        )
+        if mode != "ATTRIBUTES" or name not in _ONE_FILTER or _ONE_FILTER[name] not in (None, stride):
+            raise ValueError(f"{part.place}: expected attributes, but got {mode} by {name} of {stride} bytes")
+        self._room -= count * stride
+        if self._room < 0:
+            raise ValueError(f"{part.place}: expected at most {MOST_ARRAYS} bytes in all, but got more")
+        try:
+            elements = meshopt.decode(data, count, stride)
+        except ValueError as error:
+            raise ValueError(f"{part.place}: {error}") from None
+        if name == "EXPONENTIAL":
+            elements = meshopt.from_exponential(elements)
+        elif name == "QUATERNION":
+            elements = meshopt.from_quaternion(elements)
+        return elements.view(np.uint8).reshape(-1)
+
+
+def _parsed(text: bytes) -> Any:
+    def refuse(word: str):
+        raise ValueError(f"the number {word}")
+
+    try:
+        return json.loads(text, parse_constant=refuse)
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"expected JSON, but got {_short(str(error))}") from None
+
+
+@dataclass(frozen=True)
+class Contents:
+    """What a file holds: ``gaussians``, in its order, and their ``setting``; its format's ``version``."""
+
+    gaussians: MovingGaussians
+    setting: Setting
+    version: str
+
+
+def read(path: Path) -> Contents:
+    """Read a file.
+
+    Raises:
+        ValueError: naming the file and what is wrong with it.
+        OSError: where there is none.
+
+    Cost: about a microsecond for each 16 bytes of compressed arrays.
+    """
+    with path.open("rb") as file:
+        data = file.read(MOST_ARRAYS + 1)
+    try:
+        if len(data) > MOST_ARRAYS:
+            raise ValueError(f"expected at most {MOST_ARRAYS} bytes, but got more")
+        return _scene(Container(data))
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None
+
+
+def _scene(container: Container) -> Contents:
+    description = container.description
+    required = description.items("extensionsRequired", [])
+    if unknown := [name for name in required if name not in _KNOWN]:
+        raise ValueError(f"expected extensions known here, but got {_short(unknown[0])}")
+    number, primitive, splats = _primitive(description)
+    motion = splats.part("extensions").part(MOTION)
+    version = motion.text("version")
+    if version.split(".")[0] != FORMAT.split(".")[0]:
+        raise ValueError(f"expected version {FORMAT}, but got {_short(version)}; update forewarp")
+    if unknown := [name for name in motion.items("features", []) if name not in FEATURES]:
+        raise ValueError(f"expected features known here, but got {_short(unknown[0])}; update forewarp")
+    gaussians = _gaussians(container, primitive.part("attributes"), motion)
+    setting = Setting(
+        *_cameras(description, number),
+        torch.tensor(motion.numbers("focus", 3, [0, 0, 0]), dtype=torch.float64),
+        motion.number("seconds", 1e-3, 1e6, 4),
+        tuple(motion.numbers("background", 3, [1, 1, 1])),
+    )
+    return Contents(gaussians, setting, version)
+
+
+def _primitive(description: Fields) -> tuple[int, Fields, Fields]:
+    """Return the node that holds the moving Gaussians, their primitive, and its extension."""
+    nodes, meshes = description.parts("nodes"), description.parts("meshes")
+    for number, node in enumerate(nodes):
+        if "mesh" not in node:
+            continue
+        for primitive in meshes[node.whole("mesh", 0, len(meshes) - 1)].parts("primitives"):
+            extensions = primitive.content.get("extensions")
+            splats = extensions.get(SPLATS) if isinstance(extensions, dict) else None
+            inner = splats.get("extensions") if isinstance(splats, dict) else None
+            if isinstance(inner, dict) and MOTION in inner:
+                return number, primitive, Fields(splats, SPLATS)
+    raise ValueError(f"expected Gaussians with {MOTION}, but got a glTF without them")
+
+
+def _gaussians(container: Container, attributes: Fields, motion: Fields) -> MovingGaussians:
+    """Read the canonical state and what is added to it."""
+    place = attributes.place
+
+    def array(key: str, kind: str) -> torch.Tensor:
+        values = container.array(attributes.content.get(key), kind, count, place=f"{place}.{key}")
+        if values.dtype.kind != "f":
+            raise ValueError(f"{place}.{key}: expected floats or normalised numbers, but got whole ones")
+        return torch.from_numpy(values)
+
+    count = None
+    means = array("POSITION", "VEC3")
+    count = len(means)
+    quaternions, scales, opacity = (
+        array(f"{SPLATS}:{key}", kind)
+        for key, kind in (("ROTATION", "VEC4"), ("SCALE", "VEC3"), ("OPACITY", "SCALAR"))
+    )
+    for key, good in (("SCALE", scales >= 0), ("OPACITY", (opacity >= 0) & (opacity <= 1))):
+        if not bool(good.all()):
+            raise ValueError(f"{place}.{SPLATS}:{key}: expected numbers in its range, but got others")
+    degree, harmonics = 0, []
+    while degree <= _DEGREES and f"{SPLATS}:SH_DEGREE_{degree}_COEF_0" in attributes or not degree:
+        names = [f"{SPLATS}:SH_DEGREE_{degree}_COEF_{n}" for n in range(2 * degree + 1)]
+        harmonics += [array(name, "VEC3") for name in names]
+        degree += 1
+
+    def over_time(key: str, kind: str) -> torch.Tensor | None:
+        numbers = motion.items(key, [])
+        parts = [container.array(n, kind, count, place=f"{MOTION}.{key}") for n in numbers]
+        return torch.from_numpy(np.stack(parts, 1).astype(np.float32)) if parts else None
+
+    colors, opacities = over_time("colorOverTime", "VEC3"), over_time("opacityOverTime", "SCALAR")
+    logits = torch.logit(opacity.double())[:, 0].float()
+    if opacities is not None:
+        opacities = opacities[..., 0]
+        number = motion.content.get("opacityLogits")
+        logits = container.array(number, "SCALAR", count, place=f"{MOTION}.opacityLogits")[:, 0]
+        logits = torch.from_numpy(logits.astype(np.float32))
+    canonical_time = motion.number("canonicalTime", 0, 1)
+    return MovingGaussians(
+        means, scales.log(), quaternions.roll(1, -1), logits, torch.stack(harmonics, 1), colors, opacities,
+        canonical_time, motion.number("blur", 0, 1e3), _motion(container, motion, canonical_time, count),
+    )  # fmt: skip
+
+
+def _motion(container: Container, motion: Fields, canonical_time: float, count: int) -> NodeMotion | None:
+    """Read nodes and links; None where nothing moves."""
+    moving = motion.whole("moving", 0, count)
+    if not moving:
+        return None
+    nodes, about = motion.part("nodes"), motion.part("curve")
+    positions = container.array(nodes.content.get("positions"), "VEC3", place=f"{nodes.place}.positions")
+    kind, frames = about.text("kind"), about.whole("frames", 2, 10**9)
+    natural = kind == "spline" and about.flag("natural", False)
+    if kind not in KINDS:
+        raise ValueError(f"{about.place}.kind: expected {' or '.join(KINDS)}, but got {_short(kind)}")
+    least = 1 if kind == "cosines" else 2 if natural else 4
+    number = about.whole("count", least, frames - 1 if kind == "cosines" else 10**6)
+    if kind == "cosines" and about.number("padding", 0, 1) != PADDING:
+        raise ValueError(f"{about.place}.padding: expected {PADDING}, but got {about.content['padding']}")
+    curves = [
+        torch.from_numpy(
+            container.array(nodes.content[key], "VEC3", len(positions) * number, place=f"{nodes.place}.{key}")
+        ).reshape(-1, number, 3)
+        if key in nodes or key == "translations"
+        else None
+        for key in ("translations", "rotations")
+    ]
+    links, weights = _links(container, motion, moving, len(positions))
+    padded = torch.zeros(2, count, links.shape[1])
+    padded[0, :moving], padded[1, :moving] = links, weights
+    curve = Curve.exactly(kind, number, frames, canonical_time, straight=natural)
+    return NodeMotion(
+        torch.from_numpy(positions), *curves, curve, padded[0].int(), padded[1], *_offsets(container, motion)
+    )
+
+
+def _links(
+    container: Container, motion: Fields, moving: int, nodes: int
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Read the nodes (N, L) that those that move follow, and their shares, which sum to 1."""
+    tables = []
+    for key in ("links", "weights"):
+        numbers = motion.items(key)
+        parts = [container.array(n, "VEC4", moving, place=f"{MOTION}.{key}") for n in numbers]
+        if not parts:
+            raise ValueError(f"{MOTION}.{key}: expected accessors, but got none")
+        tables.append(np.concatenate(parts, 1))
+    links, weights = tables
+    if links.shape != weights.shape or links.dtype.kind not in "ui" or int(links.max()) >= nodes:
+        raise ValueError(f"{MOTION}.links: expected numbers below {nodes} with weights, but got others")
+    total = weights.sum(1, keepdims=True, dtype=np.float64)
+    if weights.min() < 0 or not (total > 0).all():
+        raise ValueError(f"{MOTION}.weights: expected numbers >= 0, and one above, but got others")
+    return torch.from_numpy(links.astype(np.int32)), torch.from_numpy((weights / total).astype(np.float32))
+
+
+def _offsets(container: Container, motion: Fields) -> tuple[list[float], list[float]]:
+    """Read the offsets of times; none if there are none."""
+    if "timeOffsets" not in motion:
+        return [], []
+    part = motion.part("timeOffsets")
+    times, offsets = (
+        container.array(part.content.get(key), "SCALAR", place=f"{part.place}.{key}")[:, 0].astype(float)
+        for key in ("times", "offsets")
+    )
+    good = len(times) == len(offsets) and bool((np.diff(times) > 0).all())
+    if not good or float(np.abs(offsets).max()) > FARTHEST + 1e-6:
+        raise ValueError(
+            f"{part.place}: expected ascending times with offsets of at most {FARTHEST}, but got others"
+        )
+    return times.tolist(), offsets.tolist()
+
+
+def _cameras(description: Fields, scene: int) -> tuple[list[Camera], torch.Tensor]:
+    """Return the cameras below the scene's node, and the rotation of that node."""
+    nodes, cameras = description.parts("nodes"), description.parts("cameras")
+    found = []
+    for number in nodes[scene].items("children", []):
+        if type(number) is not int or not 0 <= number < len(nodes):
+            raise ValueError(f"{nodes[scene].place}.children: expected nodes, but got {_short(number)}")
+        if "camera" in (node := nodes[number]):
+            camera = cameras[node.whole("camera", 0, len(cameras) - 1)]
+            found.append(_camera(node, camera.part("extras"), camera.part("perspective")))
+    return found, _rotation(nodes[scene])
+
+
+def _rotation(node: Fields) -> torch.Tensor:
+    from scipy.spatial.transform import Rotation  # late, as its import takes time
+
+    quaternion = node.numbers("rotation", 4, [0, 0, 0, 1])
+    if math.hypot(*quaternion) < 0.5:
+        raise ValueError(f"{node.place}.rotation: expected a unit quaternion, but got {_short(quaternion)}")
+    return torch.from_numpy(Rotation.from_quat(quaternion).as_matrix())
+
+
+def _camera(node: Fields, extras: Fields, perspective: Fields) -> Camera:
+    pose = torch.eye(4, dtype=torch.float64)
+    pose[:3, :3] = _rotation(node) * torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64)
+    pose[:3, 3] = torch.tensor(node.numbers("translation", 3, [0, 0, 0]), dtype=torch.float64)
+    lens = extras.numbers("lens", 5) if "lens" in extras else None
+    return Camera(
+        *(extras.whole(key, 1, 2**16) for key in ("width", "height")),
+        *(extras.number(key, 1e-6, 1e9) for key in ("fx", "fy")),
+        *(extras.number(key, -1e9, 1e9) for key in ("cx", "cy")),
+        pose,
+        *(perspective.number(key, 0, 1e30) for key in ("znear", "zfar")),
+        skew=extras.number("skew", -1e9, 1e9, 0),
+        lens=None if lens is None else Lens(tuple(lens[:3]), tuple(lens[3:])),
+    )

@@ -1,0 +1,363 @@
+"""What is written is read back; what is none of ours is refused."""
+
+import json
+import math
+import struct
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+import torch
+
+import forewarp
+from forewarp.fields.moving import MovingGaussians
+from forewarp.glb.reader import read
+from forewarp.glb.writer import COMPACT, LOSSLESS, MOTION, SPLATS, Setting, morton, rows_in_file, write
+from forewarp.scene.camera import Lens
+from forewarp.scene.cloud import Ellipsoids
+from forewarp.scene.view import Moment, View
+from tests.support.particles import EVERY, module_with, shaken, small_data
+
+DATA = small_data(frames=9)
+CAMERAS = [frame.camera for frame in DATA.scene.train]
+TIMES = (0.0, 0.13, 0.5, 1.0)
+OPTIONS = {
+    "natural splines": {},
+    "splines": {"numbers": {"natural_splines": False}},
+    "cosines": {"motion": "cosines"},
+    "no rotation": {"rotation": None},
+    "no motion": {"motion": None, "color_over_time": 1},
+    "every effect": EVERY | {"view_dependence": 3},
+    "no offsets": {"numbers": {"time_offsets": 0.0}, "view_dependence": None},
+}
+
+
+def moving(**options):
+    """Random particles."""
+    method = shaken(module_with(DATA, **options)).method
+    method.opacity.data[::7] = -9.0  # some have faded
+    if method.nodes is not None and method.nodes.time_offsets is not None:
+        method.nodes.time_offsets.values.data *= 5
+    return method.moving()
+
+
+def written(gaussians, quality=LOSSLESS, cameras=CAMERAS):
+    setting = Setting(
+        cameras, torch.eye(3, dtype=torch.float64), torch.ones(3).double(), 2.5, (0.0, 0.5, 1.0)
+    )
+    return write(gaussians, setting, quality, *rows_in_file(gaussians))
+
+
+@pytest.fixture(scope="module")
+def every():
+    return moving(**OPTIONS["every effect"])
+
+
+@pytest.fixture
+def kept(tmp_path):
+    """``kept(data)`` is a file of these bytes."""
+
+    def keep(data):
+        path = tmp_path / "scene.glb"
+        path.write_bytes(data)
+        return path
+
+    return keep
+
+
+def parts(cloud: Ellipsoids) -> dict[str, torch.Tensor]:
+    return {field.name: getattr(cloud, field.name) for field in fields(cloud)}
+
+
+@pytest.mark.parametrize("options", OPTIONS.values(), ids=OPTIONS)
+def test_a_lossless_file_holds_what_the_model_shows_at_all_times(options, kept):
+    gaussians = moving(**options)
+    held = read(kept(written(gaussians))).gaussians
+    order, count = rows_in_file(gaussians)
+    assert 0 < len(order) < len(gaussians.means)
+    assert held.moves == (options.get("motion", "spline") is not None) == (count > 0)
+    for time in TIMES:
+        now, wanted = parts(held.ellipsoids(time)), parts(gaussians.ellipsoids(time)[order])
+        for name in wanted:
+            torch.testing.assert_close(now[name], wanted[name], rtol=3e-5, atol=3e-6, msg=name)
+    if gaussians.motion is not None and gaussians.motion.times:
+        assert max(map(abs, gaussians.motion.offsets)) > 0.01
+        assert held.motion.motion_time(0.13) == pytest.approx(gaussians.motion.motion_time(0.13), abs=1e-6)
+
+
+def test_a_compact_file_is_near_it_and_much_smaller(every, kept):
+    data = written(every, COMPACT)
+    assert len(unpacked(data)[1]) < 0.45 * len(unpacked(written(every))[1])
+    held, (order, count) = read(kept(data)).gaussians, rows_in_file(every)
+    pixel = 0.01  # at least, of images of 20 pixels
+    for time in TIMES:
+        now, wanted = held.ellipsoids(time), every.ellipsoids(time)[order]
+        assert float((now.centers - wanted.centers).norm(dim=-1).max()) < pixel
+        error = (now.covariances - wanted.covariances).abs().amax((1, 2))
+        size = wanted.covariances.diagonal(dim1=1, dim2=2).sum(1)
+        assert bool((error < 0.05 * size + pixel**2).all())
+        torch.testing.assert_close(now.opacity, wanted.opacity, rtol=0, atol=0.02)
+        torch.testing.assert_close(now.harmonics, wanted.harmonics, rtol=0, atol=0.06)
+    assert 0 < count < len(order)  # those at rest come last
+    weights = held.motion.weights.sum(1)
+    torch.testing.assert_close(weights[:count], torch.ones(count))
+    assert not weights[count:].any()
+
+
+def test_images_of_a_file_are_those_of_the_run(every, kept):
+    camera = replace(CAMERAS[1], skew=0.4, lens=Lens((0.1, -0.05, 0.0), (0.01, 0.0)))
+    scene = forewarp.load(kept(written(every, cameras=[camera, *CAMERAS[2:5]])))
+    assert len(scene.cameras) == 4
+    for field in fields(camera):
+        if field.name not in ("camera_to_world", "near"):
+            assert getattr(scene.cameras[0], field.name) == getattr(camera, field.name)
+    torch.testing.assert_close(scene.cameras[0].camera_to_world, camera.camera_to_world)
+    assert (scene.seconds, scene.background.tolist()) == (2.5, [0.0, 0.5, 1.0])
+    for time in (0.0, 0.7):
+        wanted = every.at(Moment(time)).render(View(camera), scene.background).rgb.clamp(0, 1)
+        image = scene.render(scene.cameras[0], time, scene.background)
+        torch.testing.assert_close(image.reshape(-1, 3), wanted, rtol=0, atol=1e-4)
+        assert image.std() > 0.05
+    points = scene.matter().points[:5]
+    paths = scene.trajectories(points, [every.canonical_time, 0.9])
+    torch.testing.assert_close(paths[:, 0], points, rtol=0, atol=1e-3)
+    wanted = every.trajectories(points, torch.tensor([0.9]))[:, 0]
+    torch.testing.assert_close(paths[:, 1], wanted, rtol=0, atol=1e-3)
+    with pytest.raises(ValueError, match="time: expected a number in"):
+        scene.render(scene.cameras[0], 1.5)
+
+
+def test_points_near_each_other_lie_near_each_other_in_a_file():
+    points = np.random.default_rng(0).normal(size=(2000, 3))
+    ordered = points[np.argsort(morton(points))]
+    apart = [np.linalg.norm(np.diff(places, axis=0), axis=1).mean() for places in (points, ordered)]
+    assert apart[1] < 0.25 * apart[0]
+    assert morton(np.zeros((3, 3))).tolist() == [0, 0, 0]
+
+
+def test_a_scene_of_one_particle_at_rest(kept):
+    one = torch.zeros(1, 3)
+    colors = torch.full((1, 1, 3), 0.3)
+    still = MovingGaussians(
+        one, one - 1, torch.zeros(1, 4), torch.zeros(1), colors, None, None, 0.0, 0.1, None
+    )
+    for quality in (LOSSLESS, COMPACT):
+        held = read(kept(written(still, quality))).gaussians
+        assert not held.moves
+        torch.testing.assert_close(held.means, one)
+        torch.testing.assert_close(
+            held.at(Moment(0.3)).gaussians.opacity, torch.zeros(1, 1), rtol=0, atol=0.01
+        )
+        turned = held.template().roots  # a quaternion of length 0 turns nothing
+        torch.testing.assert_close(turned, math.exp(-1) * torch.eye(3)[None], rtol=0, atol=0.01)
+
+
+# What is refused -------------------------------------------------------------------------------------------
+
+
+def unpacked(data):
+    """The description of a file, and its arrays."""
+    size = struct.unpack_from("<I", data, 12)[0]
+    return json.loads(data[20 : 20 + size]), data[28 + size :]
+
+
+def packed(description, binary):
+    text = description if isinstance(description, bytes) else json.dumps(description).encode()
+    text += b" " * (-len(text) % 4)
+    body = (
+        struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(binary), b"BIN\0") + binary
+    )
+    return struct.pack("<4sII", b"glTF", 2, 12 + len(body)) + body
+
+
+def motion_of(description):
+    return description["meshes"][0]["primitives"][0]["extensions"][SPLATS]["extensions"][MOTION]
+
+
+def attributes_of(description):
+    return description["meshes"][0]["primitives"][0]["attributes"]
+
+
+def setter(path, value):
+    """Sets a property by its path of keys."""
+
+    def change(description):
+        *head, last = path
+        for key in head:
+            description = description[key]
+        if value is None:
+            del description[last]
+        else:
+            description[last] = value
+
+    return change
+
+
+def in_motion(*path_and_value):
+    *path, value = path_and_value
+    return lambda description: setter(path, value)(motion_of(description))
+
+
+COMPRESSED = ("bufferViews", 0, "extensions", "EXT_meshopt_compression")
+WRONG = {
+    "another major version": (in_motion("version", "2.0"), "expected version 1.0, but got '2.0'"),
+    "no version": (in_motion("version", None), "version: expected a text, but got none"),
+    "an unknown feature": (in_motion("features", ["births"]), "features known here, but got 'births'"),
+    "an unknown extension": (setter(["extensionsRequired"], ["KHR_x"]), "known here, but got 'KHR_x'"),
+    "no extension": (
+        lambda d: d["meshes"][0]["primitives"][0].pop("extensions"),
+        f"expected Gaussians with {MOTION}, but got a glTF without",
+    ),
+    "no meshes": (setter(["meshes"], []), "mesh: expected a whole number from 0 to -1, but got 0"),
+    "an accessor that there is not": (in_motion("nodes", "positions", 999), "accessors, but got 999"),
+    "a negative accessor": (in_motion("links", [-1]), "accessors, but got -1"),
+    "no positions": (lambda d: attributes_of(d).pop("POSITION"), "POSITION: expected one of"),
+    "no second harmonic": (
+        lambda d: attributes_of(d).pop(f"{SPLATS}:SH_DEGREE_2_COEF_4"),
+        "SH_DEGREE_2_COEF_4: expected one of",
+    ),
+    "another type": (setter(["accessors", 0, "type"], "VEC4"), "POSITION: expected rows of VEC3, but got"),
+    "too many rows": (setter(["accessors", 1, "count"], 10**6), "ROTATION: expected"),
+    "absurd counts": (
+        setter(["accessors", 0, "count"], 2**60),
+        "count: expected a whole number from 1 to 1073741824, but got",
+    ),
+    "an absurd view": (
+        lambda d: [setter([*COMPRESSED, "count"], 2**29)(d), setter(["accessors", 0, "count"], 2**29)(d)],
+        "expected at most 1073741824 bytes in all",
+    ),
+    "a large view": (
+        setter([*COMPRESSED, "count"], 10**7),
+        "expected 10000000 elements by attribute codec 0",
+    ),
+    "a view beyond the end": (setter([*COMPRESSED, "byteOffset"], 2**30), "bytes, but got"),
+    "an unknown filter": (
+        setter([*COMPRESSED, "filter"], "COLOR"),
+        "expected attributes, but got ATTRIBUTES by",
+    ),
+    "triangles": (setter([*COMPRESSED, "mode"], "TRIANGLES"), "but got TRIANGLES"),
+    "an odd stride": (setter([*COMPRESSED, "byteStride"], 6), "expected a stride of"),
+    "a sparse accessor": (setter(["accessors", 0, "sparse"], {}), "expected plain numbers"),
+    "an unknown component": (setter(["accessors", 0, "componentType"], 5130), "expected plain numbers"),
+    "a word for a number": (
+        in_motion("canonicalTime", "soon"),
+        "canonicalTime: expected a number from 0 to 1",
+    ),
+    "true for a number": (in_motion("moving", True), "moving: expected a whole number from"),
+    "more that move": (in_motion("moving", 10**5), "moving: expected a whole number from 0 to"),
+    "an unknown curve": (in_motion("curve", "kind", "bezier"), "kind: expected spline or cosines"),
+    "a curve of other length": (in_motion("curve", "count", 9), "translations: expected"),
+    "no nodes": (in_motion("nodes", None), "nodes: expected an object, but got None"),
+    "no weights": (in_motion("weights", []), "weights: expected accessors, but got none"),
+    "offsets of other length": (
+        lambda d: in_motion("timeOffsets", "offsets", motion_of(d)["opacityLogits"])(d),
+        "expected ascending times with offsets",
+    ),
+    "a list for an object": (setter(["meshes", 0], []), r"meshes[0]: expected an object, but got []"),
+    "no lens": (setter(["cameras", 0, "extras", "lens"], [1]), "lens: expected 5 numbers, but got [1]"),
+    "no image": (setter(["cameras", 0, "extras", "width"], 0), "width: expected a whole number from 1"),
+    "no rotation": (setter(["nodes", 0, "rotation"], [0, 0, 0, 0]), "expected a unit quaternion"),
+    "no node": (setter(["nodes", 0, "children"], [10**6]), "children: expected nodes, but got 1000000"),
+}
+
+
+@pytest.mark.parametrize(("change", "says"), WRONG.values(), ids=WRONG)
+def test_a_file_with_a_mistake_is_refused_by_name(every, kept, change, says):
+    description, binary = unpacked(written(every, COMPACT))
+    change(description)
+    path = kept(packed(description, binary))
+    with pytest.raises(ValueError) as caught:  # noqa: PT011
+        forewarp.load(path)
+    text = str(caught.value)
+    assert text.startswith(f"{path}: ")
+    assert says in text
+    assert "\n" not in text
+    assert len(text) < 300 + len(str(path))
+
+
+@pytest.mark.parametrize(
+    ("made", "says"),
+    [
+        (lambda data: b"", "expected a binary glTF, but got another file"),
+        (lambda data: b"ply\nformat ascii 1.0\n" * 9, "expected a binary glTF, but got another file"),
+        (lambda data: data[:-1], "bytes, as its header says, but got"),
+        (lambda data: data + b"more", "bytes, as its header says, but got"),
+        (lambda data: data[:4] + struct.pack("<I", 1) + data[8:], "expected version 2 of glTF, but got 1"),
+        (lambda data: data[:12] + b"\xff\xff\xff\x7f" + data[16:], "expected a chunk of 2147483647 bytes"),
+        (lambda data: packed(b"{}", b""), f"expected Gaussians with {MOTION}"),
+        (lambda data: packed(b"[1, 2", b""), "expected JSON, but"),
+        (lambda data: packed(b"[" * 10**5, b""), "expected JSON, but"),
+        (lambda data: packed(b"\xff\xfe", b""), "expected JSON, but"),
+        (lambda data: packed(b'{"nodes": NaN}', b""), "expected JSON, but got 'the number NaN'"),
+        (lambda data: packed(b'{"a": ' + b"9" * 5000 + b"}", b""), "expected JSON, but"),
+        (lambda data: packed(b"[]", b""), "glTF: expected an object, but got []"),
+        (lambda data: struct.pack("<4sII", b"glTF", 2, 12), "expected a chunk of JSON and one of arrays"),
+    ],
+)
+def test_other_files_are_refused_by_name(every, kept, made, says):
+    path = kept(made(written(every, COMPACT)))
+    with pytest.raises(ValueError, match=r"^[^\n]*$") as caught:
+        forewarp.load(path)
+    assert str(caught.value).startswith(f"{path}: ")
+    assert says in str(caught.value)
+
+
+def test_a_file_that_there_is_not_is_named(tmp_path):
+    with pytest.raises(OSError, match=r"nothing\.glb"):
+        forewarp.load(tmp_path / "nothing.glb")
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf])
+@pytest.mark.parametrize("key", ["POSITION", f"{SPLATS}:SCALE", "translations", "weights"])
+def test_numbers_that_are_none_are_refused(every, kept, key, value):
+    description, binary = unpacked(written(every))
+    motion = motion_of(description)
+    number = {"translations": motion["nodes"]["translations"], "weights": motion["weights"][0]}.get(key)
+    number = attributes_of(description)[key] if number is None else number
+    begin = description["bufferViews"][description["accessors"][number]["bufferView"]]["byteOffset"]
+    wrong = binary[:begin] + struct.pack("<f", value) + binary[begin + 4 :]
+    with pytest.raises(ValueError, match=f"{key}: expected finite numbers, but got others"):
+        read(kept(packed(description, wrong)))
+
+
+@pytest.mark.parametrize(
+    ("key", "dtype", "value", "says"),
+    [
+        ("links", "<u1", 255, "links: expected numbers below"),
+        ("weights", "<f4", -1.0, "weights: expected numbers >= 0"),
+        (f"{SPLATS}:OPACITY", "<f4", 1.5, "OPACITY: expected numbers in its range"),
+        (f"{SPLATS}:SCALE", "<f4", -1.0, "SCALE: expected numbers in its range"),
+        ("times", "<f4", 2.0, "expected ascending times"),
+        ("offsets", "<f4", 0.5, "offsets of at most 0.2"),
+    ],
+)
+def test_numbers_out_of_range_are_refused(every, kept, key, dtype, value, says):
+    description, binary = unpacked(written(every))
+    motion = motion_of(description)
+    places = attributes_of(description) | motion["timeOffsets"]
+    places |= {name: motion[name][0] for name in ("links", "weights")}
+    begin = description["bufferViews"][description["accessors"][places[key]]["bufferView"]]["byteOffset"]
+    stored = np.array([value], dtype).tobytes()
+    wrong = binary[:begin] + stored + binary[begin + len(stored) :]
+    with pytest.raises(ValueError) as caught:  # noqa: PT011
+        read(kept(packed(description, wrong)))
+    assert says in str(caught.value)
+
+
+def test_what_is_not_known_beside_it_is_passed_over(every, kept):
+    description, binary = unpacked(written(every, COMPACT))
+    motion_of(description).update(version="1.7", births=[1], extras={"a": 1})
+    description["animations"] = [{}]
+    assert read(kept(packed(description, binary))).version == "1.7"
+
+
+def test_random_damage_is_an_answer_in_one_line_or_none(every, kept):
+    data, generator = written(every, COMPACT), np.random.default_rng(0)
+    for _ in range(60):
+        wrong = bytearray(data)
+        for place in generator.integers(12, len(wrong), 3):
+            wrong[place] = int(generator.integers(256))
+        try:
+            read(kept(bytes(wrong)))
+        except ValueError as error:
+            assert "\n" not in str(error)  # noqa: PT017
