@@ -27,7 +27,8 @@ def row(folder: str) -> str:
     scene, targets = run.datamodule.scene, run.datamodule.targets("test")
     background = tuple(targets.background.tolist())
     cameras, times = zip(*((frame.camera, frame.time) for frame in scene.train))
-    source, sizes, values = Source(module, "particles", cameras, [0.0], background, times), [], []
+    source = Source(module, "particles", cameras, [0.0], background, image_times=times)
+    sizes, values = [], []
     with tempfile.TemporaryDirectory() as out:
         for quality in ("compact", "lossless"):
             about = write("glb", source, Path(out) / quality, {}, no_progress, quality=quality, seconds=4.0)

@@ -40,8 +40,8 @@ def no_progress(done: int, total: int) -> None:
 @dataclass(frozen=True)
 class Source:
     """A fitted ``module``, named ``model`` in its config, the ``cameras`` it was trained with, ``times`` in
-    [0, 1], the ``background`` (3,) in [0, 1] of its images, the ``name`` of the scene and, if known, when each
-    camera took its image.
+    [0, 1], the ``background`` (3,) in [0, 1] of its images, the scene's ``name``, and, if known,
+    ``image_times``, when each camera took its image.
     """
 
     module: DynamicSceneModule
