@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 _SOLID = 0.1  # opacity from which matter bounds the scene
 _FRAMES, _CAMERAS = 32, 8  # at whose times, and from which of them, motion is looked at
-_MOVES = 1.5  # pixels from the mean place, from which on it is seen that a particle moves
+MOVES = 1.5  # pixels from the mean place, from which on it is seen that a particle moves
 _ALIKE = 9  # particles beside each other, whose median counts
 
 
@@ -58,7 +58,7 @@ def moving(self: Particles) -> MovingGaussians:
 
 @torch.no_grad()
 def in_motion(self: Particles, frames: Sequence[Frame]) -> Tensor:
-    """See ``HasLayers``. A particle moves that goes more than ``_MOVES`` pixels from its mean place, in half
+    """See ``HasLayers``. A particle moves that goes more than ``MOVES`` pixels from its mean place, in half
     of some cameras' images. Motion along their rays, of which images say little, is none; neither is that at
     times of which no image shows the place. Single particles stray: the median with the nearest others
     counts. What rests, or follows only nodes that have stopped, does not move.
@@ -78,7 +78,7 @@ def in_motion(self: Particles, frames: Sequence[Frame]) -> Tensor:
         ranges.append(torch.where(((depth > 0) | ~shown).all(0), away, torch.nan))
     ranges = torch.stack(ranges).nanmedian(0).values.nan_to_num()
     beside = nearest(self.means.data, self.means.data, _ALIKE)[1]
-    return (ranges[beside].median(-1).values > _MOVES) & (self.skinning.shares.sum(-1) > 0)
+    return (ranges[beside].median(-1).values > MOVES) & (self.skinning.shares.sum(-1) > 0)
 
 
 def _in_image(camera: Camera, points: Tensor) -> Tensor:
