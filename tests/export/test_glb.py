@@ -4,6 +4,7 @@ import json
 import shutil
 import subprocess
 from dataclasses import fields, replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -29,7 +30,7 @@ def export(source, folder, **options):
 def test_particles_are_written_with_what_a_page_needs(particles, tmp_path):
     about, file = export(particles, tmp_path / "glb", quality="lossless")
     scene, gaussians = forewarp.load(file), particles.method.moving()
-    order, count = rows_in_file(gaussians)
+    order, count, _ = rows_in_file(gaussians)
     assert (about["particles"], about["moving"], about["left out"]) == (len(order), count, 0)
     assert about["bytes"] == {"scene.glb": file.stat().st_size}
     assert "times" not in about
@@ -63,6 +64,20 @@ def test_what_no_training_image_shows_is_left_out_of_compact_files_and_not_misse
         error = scene.render(camera, time).reshape(-1, 3) - wanted.detach()
         assert float(error.square().mean()) < 1e-4  # 40 dB
     assert export(particles, tmp_path / "all", quality="lossless")[0]["left out"] == 0
+
+
+def test_what_images_show_in_motion_comes_first(particles, tmp_path):
+    times = np.linspace(0, 1, len(particles.cameras)).tolist()
+    about, file = export(replace(particles, image_times=times), tmp_path / "glb", quality="lossless")
+    text = file.read_bytes()
+    description = json.loads(text[20 : 20 + int.from_bytes(text[12:16], "little")])
+    splats = description["meshes"][0]["primitives"][0]["extensions"]["KHR_gaussian_splatting"]
+    motion = splats["extensions"]["FOREWARP_gaussian_motion"]
+    frames = [SimpleNamespace(camera=c, time=t) for c, t in zip(particles.cameras, times)]
+    wanted = particles.method.moving().means[particles.method.in_motion(frames)]
+    assert about["moving"] == motion["inMotion"] == len(wanted) < motion["moving"]
+    first = forewarp.load(file).gaussians.means[: len(wanted)]
+    torch.testing.assert_close(first.sort(0).values, wanted.sort(0).values)
 
 
 def test_an_image_counts_the_pixels_that_a_particle_makes_up(particles):

@@ -66,7 +66,7 @@ def written(gaussians, quality=LOSSLESS, cameras=CAMERAS):
     setting = Setting(
         cameras, torch.eye(3, dtype=torch.float64), torch.ones(3).double(), 2.5, (0.0, 0.5, 1.0)
     )
-    return write(gaussians, setting, quality, *rows_in_file(gaussians))
+    return write(gaussians, setting, quality, rows_in_file(gaussians))
 
 
 @pytest.fixture(scope="module")
@@ -94,7 +94,7 @@ def parts(cloud: Ellipsoids) -> dict[str, torch.Tensor]:
 def test_a_lossless_file_holds_what_the_model_shows_at_all_times(options, kept):
     gaussians = moving(**options)
     held = read(kept(written(gaussians))).gaussians
-    order, count = rows_in_file(gaussians)
+    order, count, _ = rows_in_file(gaussians)
     assert 0 < len(order) < len(gaussians.means)
     assert held.moves == (options.get("kind", "spline") is not None) == (count > 0)
     for time in TIMES:
@@ -108,7 +108,7 @@ def test_a_lossless_file_holds_what_the_model_shows_at_all_times(options, kept):
 def test_a_compact_file_is_near_it_and_much_smaller(every, kept):
     data = written(every, COMPACT)
     assert len(unpacked(data)[1]) < 0.45 * len(unpacked(written(every))[1])
-    held, (order, count) = read(kept(data)).gaussians, rows_in_file(every)
+    held, (order, count, _) = read(kept(data)).gaussians, rows_in_file(every)
     least = 0.02  # a sixth of a pixel of these images
     for time in TIMES:
         now, wanted = held.ellipsoids(time), every.ellipsoids(time)[order]
@@ -264,6 +264,7 @@ WRONG = {
         "canonicalTime: expected a number from 0 to 1",
     ),
     "true for a number": (in_motion("moving", True), "moving: expected a whole number from"),
+    "more in motion": (in_motion("inMotion", 10**5), "inMotion: expected a whole number from 0 to"),
     "more that move": (in_motion("moving", 10**5), "moving: expected a whole number from 0 to"),
     "an unknown curve": (in_motion("curve", "kind", "bezier"), "kind: expected spline or cosines"),
     "a curve of other length": (in_motion("curve", "count", 9), "translations: expected"),

@@ -10,10 +10,10 @@ from torch import Tensor
 from forewarp.export.tracks import Progress, Source, no_progress
 from forewarp.fields.moving import MovingGaussians
 from forewarp.glb.writer import COMPACT, Setting, rows_in_file, write
-from forewarp.methods.method import HasBounds, HasMovingGaussians
+from forewarp.methods.method import HasBounds, HasLayers, HasMovingGaussians
 from forewarp.ops.backend import has_kernels
 from forewarp.scene.camera import focus_point
-from forewarp.scene.frame import spread
+from forewarp.scene.frame import Frame, spread
 from forewarp.scene.view import Moment
 
 _CAMERAS = 12  # of training, beside the first one
@@ -65,14 +65,28 @@ def packed_scene(
         )
     gaussians, cameras = source.method.moving().to("cpu"), list(source.cameras)
     shown = seen_in_images(gaussians, source, progress) if quality == COMPACT else None
-    order, moving = rows_in_file(gaussians, shown)
-    if not len(order):
+    rows = rows_in_file(gaussians, shown, moving_in_images(source))
+    if not len(rows.order):
         raise ValueError("run: expected particles that can be seen, but got none; train it longer")
     views = [cameras[0], *(cameras[i] for i in spread(len(cameras), _CAMERAS))]
     setting = Setting(views, source.rotation_to("y"), focus_point(cameras), float(seconds), source.background)
-    facts = {"particles": len(order), "moving": moving, "left out": len(gaussians.means) - len(order)}
+    left_out = len(gaussians.means) - len(rows.order)
+    facts = {"particles": len(rows.order), "moving": rows.in_motion, "left out": left_out}
     facts |= {"quality": quality, "seconds": seconds, "colors": "sRGB, as in the images"}
-    return write(gaussians, setting, quality, order, moving), facts
+    return write(gaussians, setting, quality, rows), facts
+
+
+def moving_in_images(source: Source) -> Tensor | None:
+    """Return which particles (N,) training images show in motion; None: whoever follows nodes."""
+    if not source.image_times or not isinstance(source.method, HasLayers):
+        return None
+    pairs = zip(source.cameras, source.image_times)
+    frames = [Frame("", time, camera, _not_loaded) for camera, time in pairs]
+    return source.method.in_motion(frames).cpu()
+
+
+def _not_loaded() -> Tensor:
+    raise NotImplementedError  # motion is told from cameras and times alone
 
 
 def seen_in_images(gaussians: MovingGaussians, source: Source, progress: Progress) -> Tensor | None:

@@ -329,6 +329,7 @@ def _gaussians(container: Container, attributes: Fields, motion: Fields) -> Movi
 def _motion(container: Container, motion: Fields, canonical_time: float, count: int) -> NodeMotion | None:
     """Read nodes and links; None where nothing moves."""
     moving = motion.whole("moving", 0, count)
+    motion.whole("inMotion", 0, moving, moving)
     if not moving:
         return None
     nodes, about = motion.part("nodes"), motion.part("curve")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -46,22 +47,22 @@ class Setting:
     background: tuple[float, float, float]
 
 
-def write(
-    gaussians: MovingGaussians, setting: Setting, quality: str, order: np.ndarray, moving: int
-) -> bytes:
+def write(gaussians: MovingGaussians, setting: Setting, quality: str, rows: Rows) -> bytes:
     """Return the file.
 
     Args:
         gaussians: on the CPU.
         setting: what else is in the file.
         quality: ``compact``: rounded to what an eye can tell; ``lossless``: float32.
-        order, moving: of ``rows_in_file``.
+        rows: of ``rows_in_file``.
     """
+    order, moving, in_motion = rows
     store = _Store(compact=quality == COMPACT)
     buffer, steps = store.buffer, _Steps.of(gaussians, setting)
     attributes = _attributes(store, steps, gaussians, order)
     motion = {"version": FORMAT, "features": [], "canonicalTime": gaussians.canonical_time}
-    motion |= _setting(setting, gaussians) | _over_time(store, steps, gaussians, order) | {"moving": moving}
+    motion |= _setting(setting, gaussians) | _over_time(store, steps, gaussians, order)
+    motion |= {"moving": moving, "inMotion": in_motion}
     if moving:
         motion |= _motion(store, steps, gaussians.motion, order[:moving])
     splats = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display", "projection": "perspective"}
@@ -127,11 +128,25 @@ def _setting(setting: Setting, gaussians: MovingGaussians) -> dict:
     }
 
 
-def rows_in_file(gaussians: MovingGaussians, shown: Tensor | None = None) -> tuple[np.ndarray, int]:
-    """Return the rows that are written, in order, and how many of them move.
+class Rows(NamedTuple):
+    """Which rows of Gaussians are written: ``order`` (N',) of them; the first ``moving`` follow nodes, and of
+    these the first ``in_motion`` are seen to move.
+    """
 
-    Those that are never more opaque than the cutoff are left out, as are those that are not ``shown`` (N,)
-    bool; those that move come first; those near each other lie near each other.
+    order: np.ndarray
+    moving: int
+    in_motion: int
+
+
+def rows_in_file(
+    gaussians: MovingGaussians, shown: Tensor | None = None, in_motion: Tensor | None = None
+) -> Rows:
+    """Choose the rows that are written; those near each other come near each other.
+
+    Args:
+        gaussians: those that are never more opaque than the cutoff are left out,
+        shown: (N,) bool, as are those that are not shown; None: all are.
+        in_motion: (N,) bool, which are seen to move; None: all that follow nodes.
     """
     logits = gaussians.opacity
     if gaussians.opacity_over_time is not None:
@@ -142,9 +157,10 @@ def rows_in_file(gaussians: MovingGaussians, shown: Tensor | None = None) -> tup
     rests = np.ones(len(seen), bool)
     if gaussians.motion is not None:
         rests = ~(gaussians.motion.weights > 0).any(-1).numpy()
-    order = np.lexsort((morton(gaussians.means.numpy()), rests))
+    still = rests if in_motion is None else rests | ~in_motion.numpy()
+    order = np.lexsort((morton(gaussians.means.numpy()), still, rests))
     order = order[seen[order]]
-    return order, int((~rests[order]).sum())
+    return Rows(order, int((~rests[order]).sum()), int((~still[order]).sum()))
 
 
 def morton(points: np.ndarray) -> np.ndarray:
