@@ -22,7 +22,7 @@ def test_it_writes_what_the_run_has_into_its_folder_and_says_so(forewarp, ok, fi
         formats, "write", lambda kind, source, *a, **k: sources.append(source) or write(kind, source, *a, **k)
     )
     done, folder = forewarp("export", str(run), "times=[0.25]"), run / "exports" / "ply"
-    assert done.out.startswith(f"written: {folder}: 1 file"), done
+    assert done.out.startswith(f"written: {folder}/frames/frame_0000.ply: 1 file"), done
     assert "ply 100% | 1/1" in done.err
     assert sources[0].background == (0, 0, 0)
     about = json.loads((folder / "about.json").read_text())

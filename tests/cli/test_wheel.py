@@ -82,6 +82,8 @@ def test_the_wheel_holds_every_configuration_and_what_reports_need(wheel):
     wanted |= {f"forewarp/sweeps/{name}" for name in files(ROOT / "sweeps")}
     report = ROOT / "src" / "forewarp" / "report"
     wanted |= {f"forewarp/report/{file.relative_to(report)}" for kind in DATA for file in report.glob(kind)}
+    player = ROOT / "src" / "forewarp" / "export" / "player"
+    wanted |= {f"forewarp/export/player/{file.name}" for file in player.iterdir()}
     assert wanted <= names
     assert {name.split("/")[0].partition("-")[0] for name in names} == {"forewarp", "hydra_plugins"}
     assert "hydra_plugins/forewarp_one_at_a_time.py" in names

@@ -12,11 +12,14 @@ import numpy as np
 import pytest
 import torch
 
+from forewarp import load
 from forewarp.drawing.images import to_bytes
 from forewarp.export.glb import packed_scene
 from forewarp.export.html import _PLAYER, page, poster
 from forewarp.glb import meshopt
 from forewarp.metrics.image import psnr
+from forewarp.scene.camera import Lens
+from forewarp.scene.frame import spread
 from forewarp.scene.view import Moment, View
 from tests.export.conftest import exporter
 from tests.glb.test_meshopt import elements
@@ -340,3 +343,43 @@ def test_compressed_views_are_decoded_as_python_encodes_them(opened):
     made = meshopt.quaternion(quaternions / np.linalg.norm(quaternions, axis=-1, keepdims=True), 9)
     got, wanted = decoded(made, "QUATERNION").view("<i2"), meshopt.from_quaternion(made)
     assert abs(got.astype(int) - wanted.astype(int)).max() <= 1
+
+
+@pytest.mark.browser
+@pytest.mark.slow
+def test_lenses_bend_what_it_draws(browser, particles, tmp_path):
+    lens = Lens((0.5, -0.2, 0.1), (0.05, -0.06))
+    cameras = [replace(camera, lens=lens) for camera in particles.cameras]
+    export(replace(particles, cameras=cameras), tmp_path / "html")
+    tab = Tab(browser, None, width=320, height=320)
+    tab.page.goto((tmp_path / "html" / "scene.html").as_uri())
+    camera = cameras[0].resized(120, 120)
+    got = drawn(tab, particles, width=120, height=120, time=0.3, camera=0)
+    assert psnr(got, rendered(particles, camera, 0.3)) > 50
+    assert psnr(got, rendered(particles, replace(camera, lens=None), 0.3)) < 38
+    assert tab.errors == []
+    tab.page.close()
+
+
+@pytest.mark.browser
+@pytest.mark.slow
+def test_the_page_of_a_run_looks_as_the_run_renders_it(browser, ok, fitted, tmp_path):
+    data = [f"data.root={fitted.parent}/scenes", "data=dnerf", "data.scene=vehicle", "budget.minutes=null"]
+    words = ["budget.iterations=200", "model=particles", "preset=demo", "trainer=cpu", "evaluate=false"]
+    ok("train", *data, *words, f"run={tmp_path}/run", "threads=1")
+    said = ok("export", f"run={tmp_path}/run", "format=html", "quality=lossless").out
+    file = tmp_path / "run" / "exports" / "html" / "scene.html"
+    assert said.startswith(f"written: {file}: 1 file, 0."), said
+    run = load(tmp_path / "run")
+    train = [frame.camera for frame in run.scene.train]
+    cameras = [train[0], *(train[i] for i in spread(len(train), 12))]
+    tab = Tab(browser, None, width=train[0].width, height=train[0].height)
+    for number in range(10):
+        time, which = number / 9, (5 * number) % len(cameras)
+        tab.page.goto("about:blank")
+        tab.page.goto(f"{file.as_uri()}?t={time}&camera={which}&controls=0")
+        tab.page.evaluate(SETTLED)
+        image = run.method.at(Moment(time)).render(View(cameras[which]), torch.ones(3)).rgb.detach()
+        assert psnr(shown(tab), image.reshape(train[0].height, train[0].width, 3).clamp(max=1)) > 50
+    assert tab.errors == []
+    tab.page.close()

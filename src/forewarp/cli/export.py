@@ -64,7 +64,8 @@ def export(config) -> None:
     options = {name: config[name] for name in FORMATS[config.format].options}
     with Counted(config.format) as progress:
         written = write(config.format, source, folder, about, progress, **options)
-    print(f"written: {folder}: {summary(written)}")
+    files = list(written["bytes"])
+    print(f"written: {folder / files[0] if len(files) == 1 else folder}: {summary(written)}")
 
 
 def summary(about: dict) -> str:

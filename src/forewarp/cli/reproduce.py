@@ -162,7 +162,7 @@ def words(text: str) -> list[str]:
 
 
 def demo(keys: Keys) -> Job:
-    """Fit the procedural vehicle by three methods, and make a video by particles."""
+    """Fit the procedural vehicle by three methods; make a video and a page that plays by particles."""
     # Kernels of particles compile for half a minute the first time, beside the others' training.
     # Processor time, as beside other work a wall clock would leave some stages without a step.
     common = ["experiment=demo", "threads=1", "trainer=cpu", "budget.clock=processor"]
@@ -171,7 +171,9 @@ def demo(keys: Keys) -> Job:
     lanes = [[[*common, f"model={model}", f"run={run}"]] for model, run in fits.items()]
     lanes[0][0].append("~stage.coarse")  # in so short a run its start alone may take all its time
     compare = ["report", "kind=compare", f"runs=[{','.join(fits.values())}]", "out=runs/demo"]
-    return Job(lanes, [compare, ["render", "run=runs/demo/particles", "path=both"]], int(keys.jobs))
+    film = ["render", "run=runs/demo/particles", "path=both"]
+    page = ["export", "run=runs/demo/particles", "format=html"]
+    return Job(lanes, [compare, film, page], int(keys.jobs))
 
 
 def tables(keys: Keys) -> Job:

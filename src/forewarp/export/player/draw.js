@@ -2,6 +2,7 @@
 // to near, blended in floats where the browser can, then all of it over the background.
 
 const ROW = 1024; // particles in a row of a texture
+const BORDER = 15; // steps along a side of an image
 const NODES = 256; // nodes in a row of their texture
 const LAYERS = ["all", "moving", "resting"];
 
@@ -12,6 +13,9 @@ uniform mat3 rotation; // world to camera
 uniform vec3 eye;
 uniform vec2 focal, middle, size;
 uniform float near, margin, blur;
+uniform vec3 radial; // of the lens
+uniform vec2 tangential;
+uniform float reach; // squared distance from the axis from which on the lens shows nothing
 uniform int count, moving, layer;
 uniform float basis[TIMES];
 uniform highp usampler2D order;
@@ -56,7 +60,16 @@ void main() {
 
   vec3 away = point - eye, local = rotation * away;
   if (!(local.z > near)) return;
-  vec2 plane = local.xy / local.z, pixel = focal * plane + middle;
+  vec2 plane = local.xy / local.z;
+  float r2 = dot(plane, plane), px = plane.x, py = plane.y;
+  if (!(r2 < reach)) return;
+  float bent = 1.0 + r2 * (radial.x + r2 * (radial.y + r2 * radial.z));
+  float slope = 2.0 * (radial.x + r2 * (2.0 * radial.y + r2 * 3.0 * radial.z));
+  vec2 lensed = bent * plane + 2.0 * px * py * tangential + tangential.yx * (r2 + 2.0 * plane * plane);
+  float xy = slope * px * py + 2.0 * (tangential.x * px + tangential.y * py);
+  float xx = bent + slope * px * px + 2.0 * tangential.x * py + 6.0 * tangential.y * px;
+  float yy = bent + slope * py * py + 2.0 * tangential.y * px + 6.0 * tangential.x * py;
+  vec2 pixel = focal * lensed + middle;
   if (any(lessThan(pixel, vec2(-margin))) || any(greaterThan(pixel, size + margin))) return;
 
   float opacity = place.w;
@@ -74,8 +87,10 @@ void main() {
     2.0 * (x * z + w * y), 2.0 * (y * z - w * x), 1.0 - 2.0 * (x * x + y * y));
   mat3 root = rotation * linear * axes;
   vec3 s = of(2).xyz, far = s * (transpose(root) * vec3(0, 0, 1));
-  vec3 u = focal.x / local.z * (s * (transpose(root) * vec3(1, 0, 0)) - plane.x * far);
-  vec3 v = focal.y / local.z * (s * (transpose(root) * vec3(0, 1, 0)) - plane.y * far);
+  vec3 across = s * (transpose(root) * vec3(1, 0, 0)) - px * far;
+  vec3 downward = s * (transpose(root) * vec3(0, 1, 0)) - py * far;
+  vec3 u = focal.x / local.z * (xx * across + xy * downward);
+  vec3 v = focal.y / local.z * (xy * across + yy * downward);
   float a = dot(u, u) + blur, b = dot(u, v), c = dot(v, v) + blur;
   vec3 normal = cross(u, v); // of a needle, a c - b b would lose all digits
   float determinant = dot(normal, normal) + (a + c - blur) * blur;
@@ -90,7 +105,8 @@ void main() {
   color += 0.4886025119029199 * (-d.y * harmonic(1) + d.z * harmonic(2) - d.x * harmonic(3));
 #endif
 #if DEGREE > 1
-  float xx = d.x * d.x, yy = d.y * d.y, zz = d.z * d.z;
+  xx = d.x * d.x, yy = d.y * d.y;
+  float zz = d.z * d.z;
   color += 1.0925484305920792 * (d.x * d.y * harmonic(4) - d.y * d.z * harmonic(5) - d.x * d.z * harmonic(7));
   color += 0.31539156525252005 * (2.0 * zz - xx - yy) * harmonic(6) + 0.5462742152960396 * (xx - yy) * harmonic(8);
 #endif
@@ -211,7 +227,36 @@ function fitted(lens, width, height) {
       lens.cy * scale + (height - lens.height * scale) / 2,
     ],
     size: [width, height],
+    bend: lens.lens ?? [0, 0, 0, 0, 0],
   };
+}
+
+// Bend a point of the plane at distance 1 as a lens (k1, k2, k3, p1, p2) does.
+function bent([k1, k2, k3, p1, p2], x, y) {
+  const r2 = x * x + y * y, scale = 1 + r2 * (k1 + r2 * (k2 + r2 * k3));
+  return [x * scale + 2 * p1 * x * y + p2 * (r2 + 2 * x * x), y * scale + 2 * p2 * x * y + p1 * (r2 + 2 * y * y)];
+}
+
+// Return the squared distance from the axis from which on a view shows nothing: somewhat beyond its border.
+// Farther out the lens's polynomial may fold points back into the image.
+function reachOf({ bend, focal, middle, size }) {
+  if (!bend.some(Boolean)) return 1e8;
+  let most = 0;
+  for (let k = 0; k <= BORDER; k++) {
+    const [u, v] = size.map((side) => (k / BORDER) * side);
+    for (const pixel of [[u, 0], [u, size[1]], [0, v], [size[0], v]]) {
+      const goal = pixel.map((value, i) => (value - middle[i]) / focal[i]);
+      let place = goal;
+      for (let step = 0; step < 20; step++) {
+        const [x, y] = bent(bend, ...place);
+        const next = [place[0] + goal[0] - x, place[1] + goal[1] - y];
+        if (!(Math.hypot(...next) < 2 * Math.hypot(...goal))) break; // beyond the fold
+        place = next;
+      }
+      most = Math.max(most, place[0] ** 2 + place[1] ** 2);
+    }
+  }
+  return 1.3 * most;
 }
 
 // Return f_k(time), by which coefficients of colour and opacity over time count.
@@ -404,6 +449,9 @@ class Renderer {
     this.setCamera(project, view);
     gl.uniform1f(project.place("margin"), scene.margin * Math.max(width, height));
     gl.uniform1f(project.place("blur"), scene.blur);
+    gl.uniform3fv(project.place("radial"), view.bend.slice(0, 3));
+    gl.uniform2fv(project.place("tangential"), view.bend.slice(3));
+    gl.uniform1f(project.place("reach"), reachOf(view));
     gl.uniform1i(project.place("count"), scene.count);
     gl.uniform1i(project.place("moving"), scene.moving);
     gl.uniform1i(project.place("layer"), LAYERS.indexOf(layer));
