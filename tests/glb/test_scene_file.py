@@ -268,6 +268,7 @@ WRONG = {
     "more that move": (in_motion("moving", 10**5), "moving: expected a whole number from 0 to"),
     "an unknown curve": (in_motion("curve", "kind", "bezier"), "kind: expected spline or cosines"),
     "a curve of other length": (in_motion("curve", "count", 9), "translations: expected"),
+    "another cutoff": (in_motion("cutoff", 0.01), "cutoff: expected 0.00392157, but got 0.01"),
     "no nodes": (in_motion("nodes", None), "nodes: expected an object, but got None"),
     "no weights": (in_motion("weights", []), "weights: expected accessors, but got none"),
     "offsets of other length": (

@@ -13,11 +13,12 @@ import numpy as np
 import torch
 
 from forewarp.fields.curves import KINDS, PADDING, Curve
-from forewarp.fields.moving import MovingGaussians, NodeMotion
+from forewarp.fields.moving import MARGIN, MovingGaussians, NodeMotion
 from forewarp.files import MOST_ARRAYS
 from forewarp.glb import meshopt
 from forewarp.glb.container import CHUNKS, COMPONENTS, COMPRESSION, ELEMENTS, MAGIC, VERSION
 from forewarp.glb.writer import FORMAT, MOTION, SPLATS, Setting
+from forewarp.ops.gaussians import LEAST_LOG
 from forewarp.scene.camera import Camera, Lens
 
 _KNOWN = {COMPRESSION, SPLATS, MOTION}  # extensions that a file may require
@@ -59,6 +60,11 @@ class Fields:
         """Return a number from ``least`` to ``most``."""
         good = lambda x: isinstance(x, int | float) and least <= x <= most  # noqa: E731
         return float(self._get(key, f"a number from {least:g} to {most:g}", good, default))
+
+    def fixed(self, key: str, value: float) -> None:
+        """Refuse a number, if there is one, that is not the only one that version 1 has."""
+        if not math.isclose(given := self.number(key, -1e30, 1e30, value), value, rel_tol=1e-6):
+            raise ValueError(f"{self.place}.{key}: expected {value:.6g}, but got {given:.6g}")
 
     def numbers(self, key: str, count: int, default: list[float] | None = None) -> list[float]:
         """Return ``count`` finite numbers."""
@@ -320,6 +326,8 @@ def _gaussians(container: Container, attributes: Fields, motion: Fields) -> Movi
         logits = container.array(number, "SCALAR", count, place=f"{MOTION}.opacityLogits")[:, 0]
         logits = torch.from_numpy(logits.astype(np.float32))
     canonical_time = motion.number("canonicalTime", 0, 1)
+    motion.fixed("cutoff", math.exp(LEAST_LOG))
+    motion.fixed("margin", MARGIN)
     return MovingGaussians(
         means, scales.log(), quaternions.roll(1, -1), logits, torch.stack(harmonics, 1), colors, opacities,
         canonical_time, motion.number("blur", 0, 1e3), _motion(container, motion, canonical_time, count),
@@ -340,8 +348,8 @@ def _motion(container: Container, motion: Fields, canonical_time: float, count: 
         raise ValueError(f"{about.place}.kind: expected {' or '.join(KINDS)}, but got {_short(kind)}")
     least = 1 if kind == "cosines" else 2 if natural else 4
     number = about.whole("count", least, frames - 1 if kind == "cosines" else 10**6)
-    if kind == "cosines" and about.number("padding", 0, 1) != PADDING:
-        raise ValueError(f"{about.place}.padding: expected {PADDING}, but got {about.content['padding']}")
+    if kind == "cosines":
+        about.fixed("padding", PADDING)
     curves = [
         torch.from_numpy(
             container.array(nodes.content[key], "VEC3", len(positions) * number, place=f"{nodes.place}.{key}")
