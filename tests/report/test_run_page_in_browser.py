@@ -7,9 +7,12 @@ import pytest
 import torch
 
 from forewarp.drawing.images import write_video
+from forewarp.export.html import player_of, script_digests
+from forewarp.export.tracks import Source
 from forewarp.report.run_page import Media, Shown, read_story, write_run_page
 from tests.report.test_run_page import told_run
 from tests.support.browser import Tab, chromium, until
+from tests.support.particles import module_with, small_data
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
 COLORS = {
@@ -134,3 +137,24 @@ def test_without_scripts_truth_and_prediction_stand_beside_each_other(browser, f
     page.get_by_text("worst", exact=True).click()
     assert page.locator("#p1").is_visible()
     context.close()
+
+
+def test_particles_play_in_it_by_the_player_s_own_scripts_alone(browser, tmp_path):
+    data = small_data()
+    module = module_with(data)
+    source = Source(
+        module, "particles", [frame.camera for frame in data.scene.train], [0.0], name="</iframe>"
+    )
+    text, _ = player_of(source)
+    media, page = Media(), tmp_path / "page.html"
+    assert not media.play(text, script_digests(), 1e5)
+    assert media.play(text, script_digests(), 1e6)
+    write_run_page(page, read_story(told_run(tmp_path)), media, megabytes=1)
+    tab = Tab(browser, None, width=900)
+    tab.page.goto(page.as_uri())
+    inner = tab.page.frames[1]
+    assert inner.evaluate("forewarp.then((door) => door.settled()).then(() => document.title)") == "</iframe>"
+    until(lambda: inner.evaluate("forewarp.then(({player}) => player.time > 0)"))
+    assert [worker.url.partition(":")[0] for worker in tab.page.workers] == ["data"]
+    assert tab.errors == []
+    tab.page.close()

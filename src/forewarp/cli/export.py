@@ -32,7 +32,16 @@ What one types most:
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 from forewarp.cli.entry import command
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from forewarp.export.tracks import Source
+    from forewarp.training.module import DynamicSceneModule
+    from forewarp.training.stages import Run
 
 
 def export(config) -> None:
@@ -49,23 +58,28 @@ def export(config) -> None:
     check_replaceable(folder, ABOUT)
     # These load torch; mistakes have been answered before.
     from forewarp.evaluation.layers import layer_of
-    from forewarp.export.tracks import Source
     from forewarp.progress import Counted
     from forewarp.runs.fitted import method_name, opened
 
     run, module = opened(saved)
-    scene = run.datamodule.scene
-    cameras = [frame.camera for frame in scene.train]
-    module.method = layer_of(module.method, config.layer, scene.train)
-    background = tuple(run.datamodule.targets("train").background.tolist())
-    taken = [frame.time for frame in scene.train]
-    source = Source(module, method_name(saved), cameras, times, background, scene.name, taken)
-    about = {"run": str(config.run), "scene": scene.name, "method": source.model, "layer": config.layer}
+    module.method = layer_of(module.method, config.layer, run.datamodule.scene.train)
+    source = source_of(run, module, method_name(saved), times)
+    about = {"run": str(config.run), "scene": source.name, "method": source.model, "layer": config.layer}
     options = {name: config[name] for name in FORMATS[config.format].options}
     with Counted(config.format) as progress:
         written = write(config.format, source, folder, about, progress, **options)
     files = list(written["bytes"])
     print(f"written: {folder / files[0] if len(files) == 1 else folder}: {summary(written)}")
+
+
+def source_of(run: Run, module: DynamicSceneModule, model: str, times: Sequence[float]) -> Source:
+    """Return what exports begin with: a fitted ``module`` of a run, a ``model`` by its config, at times."""
+    from forewarp.export.tracks import Source
+
+    frames = run.datamodule.scene.train
+    cameras, taken = [frame.camera for frame in frames], [frame.time for frame in frames]
+    background = tuple(run.datamodule.targets("train").background.tolist())
+    return Source(module, model, cameras, times, background, run.datamodule.scene.name, taken)
 
 
 def summary(about: dict) -> str:

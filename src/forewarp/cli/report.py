@@ -188,11 +188,15 @@ def _named(config: DictConfig) -> Path:
 
 
 def _render(config: DictConfig, row: dict, media) -> None:
-    """Render the telling views, and the video if the run has none; ``media`` takes each once it is made."""
+    """Render the telling views, and a player or, where there can be none, the video if the run has none;
+    ``media`` takes each once it is made.
+    """
+    from forewarp.cli.export import source_of
     from forewarp.evaluation.images import parts_of
-    from forewarp.report.run_page import FILMS, Shown, about, telling
+    from forewarp.methods.method import HasMovingGaussians
+    from forewarp.report.run_page import FILMS, Shown, about, room_of, telling
     from forewarp.runs.config import saved_config
-    from forewarp.runs.fitted import opened
+    from forewarp.runs.fitted import method_name, opened
 
     saved = saved_config(str(row["folder"]), config)
     run, module = opened(saved)
@@ -205,6 +209,12 @@ def _render(config: DictConfig, row: dict, media) -> None:
             parts = parts_of(module, targets[places[name]], MOST_SIDE)
             views.append(Shown(why, about(row, name), parts, max(camera.width, camera.height)))
     media.views = views or media.views
+    if config.path is None and isinstance(module.method, HasMovingGaussians):
+        from forewarp.export.html import player_of, script_digests
+
+        text, _ = player_of(source_of(run, module, method_name(saved), []))
+        if media.play(text, script_digests(), room_of(row, media, float(config.megabytes))):
+            return
     if media.video is not None:
         return
     if not len(targets):

@@ -42,11 +42,17 @@ def export_html(source: Source, folder: Path, progress: Progress, *, quality: st
     Raises:
         ValueError: for a method without particles, naming the formats that it has.
     """
-    content, facts = packed_scene(source, "html", quality=quality, seconds=seconds)
-    text = page(content, title=source.name, poster=poster(source), background=source.background)
+    text, facts = player_of(source, quality=quality, seconds=seconds)
     (folder / "scene.html").write_text(text, encoding="utf-8")
     progress(1, 1)
     return facts
+
+
+def player_of(source: Source, *, quality: str = "compact", seconds: float = 4.0) -> tuple[str, dict]:
+    """Return the page of a scene, and the facts; see ``export_html``."""
+    content, facts = packed_scene(source, "html", quality=quality, seconds=seconds)
+    text = page(content, title=source.name, poster=poster(source), background=source.background)
+    return text, facts
 
 
 @torch.no_grad()
@@ -68,10 +74,9 @@ def page(content: bytes, *, title: str, poster: Tensor, background: tuple[float,
     """
     side, quality = _POSTER
     deflate = zlib.compressobj(9, zlib.DEFLATED, -zlib.MAX_WBITS)
-    motion = _source("motion.js")
-    script = "\n".join(_source(name) for name in ("glb.js", "draw.js", "player.js"))
+    motion, script = _scripts()
     parts = {
-        "policy": _POLICY.format(scripts=" ".join(map(_digest, (motion, script)))),
+        "policy": _POLICY.format(scripts=" ".join(script_digests())),
         "title": html.escape(title),
         "style": _source("player.css"),
         "background": "rgb({:.0f} {:.0f} {:.0f})".format(*(255 * part for part in background)),
@@ -82,6 +87,16 @@ def page(content: bytes, *, title: str, poster: Tensor, background: tuple[float,
     }
     # In one pass, so that what is filled in is not searched again.
     return re.sub(r"\{\{(\w+)\}\}", lambda found: parts[found[1]], _source("player.html"))
+
+
+def _scripts() -> tuple[str, str]:
+    """Return the page's scripts; the worker runs the first one, too."""
+    return _source("motion.js"), "\n".join(map(_source, ("glb.js", "draw.js", "player.js")))
+
+
+def script_digests() -> list[str]:
+    """Return how a policy names the page's scripts: what encloses the page must allow them, too."""
+    return list(map(_digest, _scripts()))
 
 
 def _source(name: str) -> str:

@@ -14,7 +14,7 @@ from pathlib import Path
 from statistics import fmean
 from typing import TYPE_CHECKING
 
-from markupsafe import Markup
+from markupsafe import Markup, escape
 
 from forewarp.files import read_rows, replace_file
 from forewarp.metrics.registry import metric_of
@@ -59,12 +59,25 @@ class Shown:
 
 @dataclass
 class Media:
-    """What a page shows: views, the file of a video and what is to be seen in it; what is missing and why."""
+    """What a page shows: views, the file of a video and what is to be seen in it; what is missing and why.
+
+    A ``player`` is a page that plays the scene, shown in place of a video; ``scripts`` are the hashes of its
+    scripts, as a policy names them.
+    """
 
     views: Sequence[Shown] = ()
     video: Path | None = None
     about: str = ""
     missing: Sequence[str] = ()
+    player: str = ""
+    scripts: Sequence[str] = ()
+
+    def play(self, player: str, scripts: Sequence[str], room: float) -> bool:
+        """Take a player in place of a video, if it is no larger than a video's share of ``room`` bytes."""
+        if len(escape(player).encode()) > (1 - PICTURES) * room:
+            return False
+        self.player, self.scripts, self.video = player, scripts, None
+        return True
 
 
 def read_story(folder: Path) -> Row:

@@ -472,12 +472,13 @@ function doorOf(player) {
     // Draw frames of a size while time passes and the camera turns: frames a second, and milliseconds of the
     // worker's sorting.
     async measure({ width, height, frames = 30 }) {
-      const { renderer, sorting, scene } = player, one = new Uint8Array(4), sorts = [], begin = performance.now();
-      let busy = 0;
+      const { renderer, sorting, scene } = player, one = new Uint8Array(4), sorts = [];
+      let busy = 0, begin = 0;
       player.measured = true;
-      for (let i = 0; i < frames; i++) {
+      for (let i = -1; i < frames; i++) {
+        if (i === 0) [begin, busy] = [performance.now(), 0]; // the first frame makes ready
         const start = performance.now();
-        renderer.setTime(i / frames);
+        renderer.setTime(Math.max(i, 0) / frames);
         player.turn(0.05, 0);
         sorting.ask(renderer.maps, player.eye);
         const view = player.view(width, height);
