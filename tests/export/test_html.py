@@ -16,14 +16,16 @@ from forewarp import load
 from forewarp.drawing.images import to_bytes
 from forewarp.export.glb import packed_scene
 from forewarp.export.html import _PLAYER, page, poster
+from forewarp.export.tracks import Source
 from forewarp.glb import meshopt
 from forewarp.metrics.image import psnr
 from forewarp.scene.camera import Lens
 from forewarp.scene.frame import spread
 from forewarp.scene.view import Moment, View
-from tests.export.conftest import exporter
+from tests.export.conftest import TIMES, exporter
 from tests.glb.test_meshopt import elements
 from tests.support.browser import Tab, chromium, until
+from tests.support.particles import BARE, module_with, small_data
 
 export = exporter("html", quality="lossless", seconds=2.0)
 ATTACK = "\"'><img src=x onerror=attacked=1></script><script>attacked=1</script> {{scene}} – Ünï\u2028🙂"
@@ -381,5 +383,29 @@ def test_the_page_of_a_run_looks_as_the_run_renders_it(browser, ok, fitted, tmp_
         tab.page.evaluate(SETTLED)
         image = run.method.at(Moment(time)).render(View(cameras[which]), torch.ones(3)).rgb.detach()
         assert psnr(shown(tab), image.reshape(train[0].height, train[0].width, 3).clamp(max=1)) > 50
+    assert tab.errors == []
+    tab.page.close()
+
+
+@pytest.mark.browser
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "effects",
+    [BARE, {"motion": "cosines", "rotation": None, "view_dependence": 3}, {"opacity_over_time": 2}],
+    ids=["at rest", "cosines", "opacity"],
+)
+def test_scenes_of_other_effects_are_drawn_too(browser, tmp_path, effects):
+    data = small_data()
+    module = module_with(data, **effects)
+    for parameter in module.method.parameters():
+        parameter.data += 0.1 * torch.randn(parameter.shape, generator=torch.Generator().manual_seed(1))
+    source = Source(module, "particles", [frame.camera for frame in data.scene.train], TIMES)
+    export(source, tmp_path / "html")
+    tab = Tab(browser, None, width=320, height=320)
+    tab.page.goto((tmp_path / "html" / "scene.html").as_uri())
+    assert state(tab, "playing") == [module.method.moves]
+    for time in (0.0, 0.37, 1.0):
+        got = drawn(tab, source, width=120, height=120, time=time, camera=0)
+        assert psnr(got, rendered(source, source.cameras[0].resized(120, 120), time)) > 50
     assert tab.errors == []
     tab.page.close()

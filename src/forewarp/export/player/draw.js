@@ -303,13 +303,11 @@ class Renderer {
     this.over = this.program(WHOLE_VERTEX, OVER_FRAGMENT, defines);
     this.trail = this.program(TRAIL_VERTEX, TRAIL_FRAGMENT, defines);
     this.fillParticles(rows, times + this.times);
-    if (scene.nodes) {
-      this.nodes = this.texture(gl.TEXTURE_2D);
-      const width = 3 * Math.min(NODES, scene.nodes.count), height = Math.ceil(scene.nodes.count / NODES);
-      this.maps = new Float32Array(4 * width * height);
-      gl.texStorage2D(gl.TEXTURE_2D, 1, gl.RGBA32F, width, height);
-      this.nodeSize = [width, height];
-    }
+    const nodes = scene.nodes?.count ?? 1; // every sampler has a texture of its kind
+    this.nodeSize = [3 * Math.min(NODES, nodes), Math.ceil(nodes / NODES)];
+    this.nodes = this.texture(gl.TEXTURE_2D);
+    gl.texStorage2D(gl.TEXTURE_2D, 1, gl.RGBA32F, ...this.nodeSize);
+    this.maps = scene.nodes ? new Float32Array(4 * this.nodeSize[0] * this.nodeSize[1]) : null;
     this.splats = [0, 1].map(() => {
       const texture = this.texture(gl.TEXTURE_2D);
       gl.texStorage2D(gl.TEXTURE_2D, 1, gl.RGBA32UI, ROW, rows);
@@ -458,7 +456,7 @@ class Renderer {
     gl.uniform1fv(project.place("basis"), this.basis);
     this.bind(project, "particles", 0, this.particles, gl.TEXTURE_2D_ARRAY);
     this.bind(project, "order", 1, this.order);
-    if (scene.nodes) this.bind(project, "nodes", 2, this.nodes);
+    this.bind(project, "nodes", 2, this.nodes);
     gl.drawArrays(gl.TRIANGLES, 0, 3);
 
     gl.bindFramebuffer(gl.FRAMEBUFFER, this.target.framebuffer);
