@@ -15,7 +15,6 @@ MAY_IMPORT = {
     **dict.fromkeys(["metrics", "drawing", "fields", "data"], {"ops", "scene"}),
     "report": {"drawing", "metrics"},
     "synth": {"ops", "scene", "data"},
-    "browser": {"ops", "scene"},
     "renderer": {"ops", "scene", "fields"},
     "glb": {"ops", "scene", "fields"},
     "methods": LOWER,
@@ -23,8 +22,8 @@ MAY_IMPORT = {
     "evaluation": LOWER | {"methods", "training"},
     "runs": LOWER | {"glb", "methods", "training", "evaluation", "data"},
     "planning": LOWER | {"methods", "training", "evaluation", "data", "report", "runs"},
-    "viewer": LOWER | {"browser", "methods", "training", "evaluation"},
-    "export": LOWER | {"browser", "glb", "methods", "training", "evaluation"},
+    "viewer": LOWER | {"methods", "training", "evaluation"},
+    "export": LOWER | {"glb", "methods", "training", "evaluation"},
     "capture": {"ops", "scene", "drawing", "data"},
     "cli": LOWER
     | {

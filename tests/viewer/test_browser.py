@@ -15,9 +15,9 @@ from omegaconf import OmegaConf
 
 pytest.importorskip("viser", reason="no viser: pip install forewarp[viewer]")
 
-from forewarp.browser import vertical_fov
 from forewarp.cli.view import renderer_of
 from forewarp.runs.config import saved_config
+from forewarp.viewer.begin import vertical_fov
 from forewarp.viewer.rendering import Viewer, ViewState, camera_of
 from forewarp.viewer.server import serve
 from tests.support.browser import Tab, chromium, until

@@ -3,9 +3,9 @@ from dataclasses import replace
 import pytest
 import torch
 
-from forewarp.browser import vertical_fov
 from forewarp.scene.camera import look_at
 from forewarp.scene.view import Moment, View
+from forewarp.viewer.begin import vertical_fov
 from forewarp.viewer.queue import Cancelled
 from forewarp.viewer.rendering import SceneRenderer, Viewer, ViewState, camera_of, turning_axis
 from tests.support.particles import EVERY, module_with, shaken, small_data

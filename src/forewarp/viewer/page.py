@@ -13,11 +13,11 @@ import viser
 from torch import Tensor
 from viser.transforms import SO3
 
-from forewarp.browser import splat_arrays, vertical_fov
 from forewarp.drawing.images import hues, png_bytes, to_bytes
 from forewarp.evaluation.layers import LAYERS
 from forewarp.scene.cloud import Ellipsoids
 from forewarp.scene.frame import spread
+from forewarp.viewer.begin import splat_arrays, vertical_fov
 from forewarp.viewer.queue import Cancelled
 from forewarp.viewer.rendering import SPLATS, Viewer, turning_axis
 from forewarp.viewer.session import MAX_VIDEO_SECONDS, MIN_VIDEO_SECONDS, Session

@@ -11,7 +11,6 @@ from functools import lru_cache
 import torch
 from torch import Tensor
 
-from forewarp.browser import vertical_fov
 from forewarp.drawing.images import depth_colors, flow_colors, in_a_row, with_wheel
 from forewarp.evaluation.images import compare, image_flow
 from forewarp.evaluation.layers import LAYERS, layer_of
@@ -21,6 +20,7 @@ from forewarp.scene.camera import Camera, focus_point, mean_up
 from forewarp.scene.frame import Scene
 from forewarp.scene.view import Moment, Rendering, View
 from forewarp.training.module import DynamicSceneModule
+from forewarp.viewer.begin import vertical_fov
 from forewarp.viewer.queue import Cancelled, RenderQueue
 
 SPLATS = "splats"  # drawn by the browser; all other channels are images that the method renders

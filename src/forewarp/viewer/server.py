@@ -17,8 +17,8 @@ import lightning
 import torch
 import viser
 
-from forewarp.browser import begin_at, silent
 from forewarp.training.stages import Run
+from forewarp.viewer.begin import begin_at, silent
 from forewarp.viewer.page import Page
 from forewarp.viewer.rendering import SceneRenderer, Viewer, ViewState, turning_axis
 

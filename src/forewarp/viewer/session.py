@@ -17,8 +17,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from forewarp.browser import vertical_fov
 from forewarp.drawing.images import write_video
+from forewarp.viewer.begin import vertical_fov
 from forewarp.viewer.queue import Cancelled, FrameRate, FrameRateControl
 from forewarp.viewer.rendering import Viewer, ViewState
 

@@ -1,4 +1,4 @@
-"""What the viewer's pages and the exported page share: where they begin, and how they are sent splats."""
+"""Where pages begin, and how they are sent splats, in what viser takes."""
 
 from __future__ import annotations
 

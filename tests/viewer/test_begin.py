@@ -1,4 +1,4 @@
-"""What the viewer's pages and the exported page share; where there is no browser to test them in."""
+"""Where pages begin, and how they are sent splats; where there is no browser to test them in."""
 
 import sys
 from types import SimpleNamespace
@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import torch
 
-from forewarp.browser import begin_at, silent, splat_arrays, vertical_fov
 from forewarp.scene.cloud import Ellipsoids
+from forewarp.viewer.begin import begin_at, silent, splat_arrays, vertical_fov
 from tests.support.browser import NEEDED, chromium
 from tests.support.tiny_scene import ball_scene
 
