@@ -1,8 +1,10 @@
 """The page that plays a scene: what is in it, and the page in a real browser."""
 
 import base64
+import copy
 import html
 import io
+import json
 import re
 import zlib
 from dataclasses import replace
@@ -409,3 +411,70 @@ def test_scenes_of_other_effects_are_drawn_too(browser, tmp_path, effects):
         assert psnr(got, rendered(source, source.cameras[0].resized(120, 120), time)) > 50
     assert tab.errors == []
     tab.page.close()
+
+
+@pytest.mark.browser
+@pytest.mark.slow
+def test_trails_follow_what_moves_and_two_fingers_come_nearer(browser, particles, tmp_path):
+    export(particles, tmp_path / "html")
+    tab = Tab(browser, None, width=320, height=320, has_touch=True)
+    tab.page.goto((tmp_path / "html" / "scene.html").as_uri() + "?t=0.6&controls=0")
+    tab.page.evaluate(SETTLED)
+    plain = shown(tab)
+    tab.page.keyboard.press("t")
+    tab.page.evaluate(SETTLED)
+    ink = ((shown(tab) - plain).abs().amax(-1) > 0.1).float().mean()
+    assert 0.001 < float(ink) < 0.5
+    segments = tab.page.evaluate("forewarp.then(({scene}) => [...trailsOf(scene)])")
+    path = torch.tensor(segments).reshape(-1, 12)[:96, :4]  # of the first trail
+    centers = torch.stack([particles.method.ellipsoids(time).centers for time in path[:, 3].tolist()])
+    assert float((centers - path[:, None, :3]).norm(dim=-1).amax(0).min()) < 1e-4
+    tab.page.keyboard.press("t")
+    away, eye = state(tab, "away", "eye")
+    fingers = tab.page.context.new_cdp_session(tab.page)
+    for kind, apart in (("touchStart", 40), ("touchMove", 60), ("touchMove", 80)):
+        points = [{"x": 160 - apart, "y": 160, "id": 1}, {"x": 160 + apart, "y": 160, "id": 2}]
+        fingers.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": points})
+    fingers.send("Input.dispatchTouchEvent", {"type": "touchEnd", "touchPoints": []})
+    until(lambda: state(tab, "away")[0] == pytest.approx(away / 2, rel=0.02))
+    before = state(tab, "eye")[0]
+    for kind, x in (("touchStart", 160), ("touchMove", 200)):
+        points = [{"x": x, "y": 160, "id": 3}]
+        fingers.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": points})
+    fingers.send("Input.dispatchTouchEvent", {"type": "touchEnd", "touchPoints": []})
+    until(lambda: state(tab, "eye")[0] != before)
+    assert state(tab, "away")[0] == pytest.approx(away / 2, rel=0.02)
+    assert eye != before
+    assert tab.errors == []
+    tab.page.close()
+
+
+@pytest.mark.browser
+@pytest.mark.slow
+def test_a_broken_scene_is_told_and_the_picture_stays(browser, particles, tmp_path):
+    content, _ = packed_scene(particles, "html", quality="compact", seconds=2.0)
+    length = int.from_bytes(content[12:16], "little")
+    told, rest = json.loads(content[20 : 20 + length]), content[20 + length :]
+
+    def with_motion(**changes):
+        gltf = copy.deepcopy(told)
+        splats = gltf["meshes"][0]["primitives"][0]["extensions"]["KHR_gaussian_splatting"]["extensions"]
+        splats["FOREWARP_gaussian_motion"] |= changes
+        text = json.dumps(gltf).encode()
+        whole = (len(text) + len(rest) + 20).to_bytes(4, "little")
+        return content[:8] + whole + len(text).to_bytes(4, "little") + content[16:20] + text + rest
+
+    file, looks = tmp_path / "scene.html", {"poster": poster(particles), "background": (1.0, 1.0, 1.0)}
+    for broken, says in (
+        (content[:-100], "cut off"),
+        (b"PK" + content, "expected a glTF 2.0 binary"),
+        (with_motion(version="2.0"), "expected FOREWARP_gaussian_motion 1, but got 2.0"),
+        (with_motion(features=["births"]), "does not know births"),
+        (content.replace(b"FOREWARP_gaussian_motion", b"FOREWARP_gaussian_others"), "expected KHR_gaussian"),
+    ):
+        file.write_text(page(broken, title="scene", **looks))
+        tab = Tab(browser, None, width=320, height=320)
+        tab.page.goto(file.as_uri())
+        tab.page.get_by_text(says).wait_for()
+        assert tab.page.locator("#poster").is_visible()
+        tab.page.close()

@@ -523,33 +523,45 @@ class Renderer {
   }
 }
 
-const TRAIL_POINTS = 300, TRAIL_TIMES = 96, TRAIL_LENGTH = 0.25, TRAIL_OPACITY = 0.3;
+const TRAIL_POINTS = 300, TRAIL_TIMES = 96, TRAIL_LENGTH = 0.25;
+const TRAIL_OPACITY = 0.3, TRAIL_WAY = 0.01; // least opacity, and way as a share of the distance from the eye
 
-// Return the paths of some opaque moving particles, spread over them, as segments for ``setTrails``. Particles
-// lie in the file along a curve that fills space, so that every n-th one is about evenly spread.
+// Return some of a list, evenly spread over it.
+function spread(list, count) {
+  const many = Math.min(count, list.length);
+  return Array.from({ length: many }, (_, k) => list[Math.floor(((k + 0.5) * list.length) / many)]);
+}
+
+// Return the paths of some opaque particles that go some way, as segments for ``setTrails``. Particles lie in
+// the file along a curve that fills space, so that every n-th one is about evenly spread.
 function trailsOf(scene) {
-  const solid = [];
-  for (let i = 0; i < scene.moving; i++) if (scene.opacity[i] > TRAIL_OPACITY) solid.push(i);
-  const chosen = Array.from({ length: Math.min(TRAIL_POINTS, solid.length) }, (_, k) => {
-    return solid[Math.floor(((k + 0.5) * solid.length) / Math.min(TRAIL_POINTS, solid.length))];
-  });
-  const pick = (values, width) => Float32Array.from(chosen.flatMap((i) => [...values.subarray(width * i, width * i + width)]));
+  const solid = [...Array(scene.moving).keys()].filter((i) => scene.opacity[i] > TRAIL_OPACITY);
+  const tried = spread(solid, 5 * TRAIL_POINTS);
+  const pick = (values, width) => {
+    const out = new Float32Array(width * tried.length);
+    tried.forEach((i, row) => out.set(values.subarray(width * i, width * (i + 1)), width * row));
+    return out;
+  };
   const few = {
-    moving: chosen.length, places: pick(scene.places, 3),
+    moving: tried.length, places: pick(scene.places, 3),
     links: scene.links.map((group) => pick(group, 4)), weights: scene.weights.map((group) => pick(group, 4)),
   };
   const maps = new Float32Array(12 * (scene.nodes?.count ?? 0)), points = [];
-  for (let k = 0; k <= TRAIL_TIMES && chosen.length; k++) {
+  for (let k = 0; k <= TRAIL_TIMES && tried.length; k++) {
     nodeMaps(scene, k / TRAIL_TIMES, maps);
     points.push(few.places.slice());
     movePoints(few, maps, points[k]);
   }
-  const out = [];
-  chosen.forEach((_, i) => {
-    const hue = (i / chosen.length) * 2 * Math.PI;
+  const apart = (a, b) => Math.hypot(a[0] - b[0], a[1] - b[1], a[2] - b[2]);
+  const at = (k, row) => points[k].subarray(3 * row, 3 * row + 3);
+  const least = TRAIL_WAY * apart(scene.cameras[0].eye, scene.focus);
+  const went = (row) => Math.max(...points.map((_, k) => apart(at(k, row), at(0, row))));
+  const rows = spread([...tried.keys()].filter((row) => went(row) > least), TRAIL_POINTS), out = [];
+  rows.forEach((row, i) => {
+    const hue = (i / rows.length) * 2 * Math.PI;
     const tint = [0, 1, 2].map((c) => 0.6 + 0.4 * Math.cos(hue - (2 * Math.PI * c) / 3));
     for (let k = 0; k < TRAIL_TIMES; k++) {
-      for (const end of [k, k + 1]) out.push(...points[end].subarray(3 * i, 3 * i + 3), end / TRAIL_TIMES);
+      for (const end of [k, k + 1]) out.push(...at(end, row), end / TRAIL_TIMES);
       out.push(...tint, 0.9);
     }
   });
