@@ -17,7 +17,8 @@ from forewarp.scene.frame import Frame, spread
 from forewarp.scene.view import Moment
 
 _CAMERAS = 12  # of training, beside the first one
-_LEAST_PIXELS = 0.25  # of an image that particles make up; of those who make up less nothing is missed
+# Pixels, and share of an image: who makes up less than the smaller of these of any image is not missed.
+_LEAST_PIXELS, _LEAST_SHARE = 0.25, 1.5e-6
 
 
 def export_glb(source: Source, folder: Path, progress: Progress, *, quality: str, seconds: float) -> dict:
@@ -90,7 +91,8 @@ def _not_loaded() -> Tensor:
 
 
 def seen_in_images(gaussians: MovingGaussians, source: Source, progress: Progress) -> Tensor | None:
-    """Return which particles (N,) make up a quarter of a pixel of any training image; None without kernels.
+    """Return which particles (N,) make up some of any training image, a quarter of a pixel where it is large;
+    None without kernels.
 
     Cost: each training image is rendered, with gradients.
     """
@@ -99,6 +101,7 @@ def seen_in_images(gaussians: MovingGaussians, source: Source, progress: Progres
     most = torch.zeros(len(gaussians.means))
     views = sorted(zip(source.image_times, source.cameras), key=lambda view: view[0])
     for done, (time, camera) in enumerate(views, 1):
-        most = torch.maximum(most, gaussians.at(Moment(time)).pixels(camera))
+        least = min(_LEAST_PIXELS, _LEAST_SHARE * camera.width * camera.height)
+        most = torch.maximum(most, gaussians.at(Moment(time)).pixels(camera) / least)
         progress(done, len(views))
-    return most >= _LEAST_PIXELS if views else None
+    return most >= 1 if views else None

@@ -243,7 +243,7 @@ class _Steps:
     def of(cls, gaussians: MovingGaussians, setting: Setting) -> _Steps:
         """Choose lengths as shares of what a pixel of the cameras spans."""
         pixel = _pixel(gaussians, setting.cameras)
-        return cls(length=pixel / 16, curve=pixel / 8, scale=pixel / 16)
+        return cls(length=pixel / 16, curve=pixel / 32, scale=pixel / 16)
 
 
 def _pixel(gaussians: MovingGaussians, cameras: Sequence[Camera]) -> float:
