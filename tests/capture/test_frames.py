@@ -288,14 +288,23 @@ def test_images_are_turned_and_made_smaller_but_for_known_poses(tmp_path, known)
         assert bright == [known, not known]
 
 
-def test_with_known_poses_images_lie_in_folders_of_cameras_and_differ_in_size(tmp_path):
-    for camera, size in (("cam00", (64, 48)), ("cam01", (48, 64))):
-        (tmp_path / "p" / camera).mkdir(parents=True)
+@pytest.mark.parametrize("layout", ["cam0{}/{:04d}.png", "cam0{}_{:04d}.png"])
+def test_with_known_poses_folders_or_names_tell_cameras_apart_and_sizes_differ(tmp_path, layout):
+    for camera, size in enumerate([(64, 48), (48, 64)]):
         for number in (3, 5, 6):
-            Image.new("RGB", size).save(tmp_path / "p" / camera / f"{number:04d}.png")
-    frames = taken(tmp_path, tmp_path / "p", colmap=tmp_path)
-    names = [f"cam0{camera}/{number:04d}.png" for number in (3, 5, 6) for camera in (0, 1)]
+            path = tmp_path / "p" / layout.format(camera, number)
+            path.parent.mkdir(parents=True, exist_ok=True)
+            Image.new("RGB", size).save(path)
+    masks = tmp_path / "masks"
+    masks.mkdir()
+    for n in range(6):  # in the order of the names: the first three are of the first camera
+        Image.new("L", (64, 64), 255 * (n < 3)).save(masks / f"{n}.png")
+    frames = taken(tmp_path, tmp_path / "p", masks, colmap=tmp_path)
+    names = [layout.format(camera, number) for number in (3, 5, 6) for camera in (0, 1)]
     assert list(frames.originals.values()) == names
+    assert frames.assumed.endswith("images' names, 3 to 6; images of one number share a time")
+    moves = [Image.open(frames.masks / f"{name}.png").getpixel((0, 0)) == 0 for name in frames.times]
+    assert moves == 3 * [True, False]
     assert list(frames.times.values()) == pytest.approx([0, 0, 2 / 3, 2 / 3, 1, 1])
     assert list(frames.sizes.values()) == 3 * [(64, 48), (48, 64)]
 
@@ -381,7 +390,7 @@ def test_masks_of_a_folder_go_by_the_users_names(tmp_path):
 @pytest.mark.parametrize(
     ("names", "value", "says"),
     [
-        (["0.png", "1.png", "2.png"], 1, "brighter than 127 of 255, but got at most 1; write it as 255"),
+        (["0.png", "1.png", "2.png"], 100, "is bright, but got none above 127 of 255; write it as 255"),
         (["1.png", "2.png"], 255, r"expected 3 masks, .* \(0.png\), but got 2"),
     ],
 )

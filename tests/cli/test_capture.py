@@ -227,8 +227,8 @@ def test_masks_that_changed_are_read_again(forewarp, refused, in_tmp, monkeypatc
     with monkeypatch.context() as patched:
         patched.setattr("forewarp.capture.poses.find_features", stop)
         assert forewarp("capture", *words).status == 130
-    write_masks(1)
-    assert "brighter than 127 of 255, but got at most 1" in refused("capture", *words)
+    write_masks(100)
+    assert "what moves is bright, but got none above 127 of 255" in refused("capture", *words)
 
 
 def film(folder, count=20, size=(240, 180)):

@@ -13,6 +13,7 @@ from forewarp.data.images import (
     CACHE,
     ImageCache,
     StoredImage,
+    StoredMask,
     composited,
     halved_cutout,
     inspect_image,
@@ -153,6 +154,20 @@ def test_halves_cut_off_an_odd_row_and_mix_in_no_studio(cut_out):
     assert (rgba[5:9, 2, :3].int() - torch.tensor(SKIN)).abs().max() <= 12
     write_image(cut_out().mask, np.full((31, 40), 100, np.uint8))
     assert not cut_out()().any()
+
+
+@pytest.mark.parametrize("kind", ["palette", "RGB", "numbers", "grey"])
+def test_every_object_of_a_mask_is_foreground(tmp_path, kind):
+    """Three objects, as DAVIS colours them, the last of 64 of 255; their numbers; or soft grey."""
+    numbers = np.arange(5, dtype=np.uint8)[None].repeat(6, 0).repeat(2, 1)
+    colors = np.array([[0] * 3, [128, 0, 0], [0, 128, 0], [0, 0, 128], [64, 0, 0]], np.uint8)
+    mask = Image.fromarray(colors[numbers] if kind == "RGB" else numbers)
+    if kind == "palette":
+        mask.putpalette(colors.tobytes() + bytes(768 - 15))
+    if kind == "grey":
+        mask = mask.point([60, 128, 200, 255, 130] + 251 * [0])
+    mask.save(tmp_path / "mask.png")
+    assert StoredMask(tmp_path / "mask.png", (10, 6))().tolist() == (numbers > 0).tolist()
 
 
 class Owner:

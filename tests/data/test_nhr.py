@@ -154,7 +154,7 @@ def test_files_by_others(toy):
     """Blanks and blank lines, three-channel masks, soft mask values, clouds as .obj, a leading mark."""
     poses = "\ufeff\n" + (toy / "CamPose.inf").read_text().replace(" ", "\t ") + "\n\n"
     (toy / "CamPose.inf").write_text(poses, encoding="utf-8")
-    grey = np.array([[[127, 255, 255], [128, 0, 0]]], np.uint8).repeat(24, 0).repeat(30, 1).repeat(2, 0)
+    grey = np.array([[[127] * 3, [128] * 3]], np.uint8).repeat(24, 0).repeat(30, 1).repeat(2, 0)
     write_image(toy / "img" / "0" / "mask" / "img_0000.jpg", grey, quality=100)
     cloud = toy / "pointclouds" / "frame2.npy"
     rows = [" ".join(map(str, row)) for row in np.load(cloud).tolist()]

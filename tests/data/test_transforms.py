@@ -112,6 +112,9 @@ def test_a_vertical_angle_that_is_none_is_told_and_never_refused(angle):
         (["images_train/0001", "images_train/0005", "images_test/0003"], [0, 1, 0.5]),
         (["b", "a", "c"], [0.5, 0, 1]),
         (["a/1", "a/01", "b/7"], [0.0, 0.5, 1.0]),  # one number twice: no frame's
+        (["rgb/1305031102.9", "rgb/1305031103.15", "rgb/1305031103.4"], [0, 0.5, 1]),  # seconds
+        (["7.500000", "8.000000", "9.500000"], [0, 0.25, 1]),
+        (["1.0001", "1.0002", "2.0001", "2.0002"], [0, 1, 0, 1]),  # camera and frame
     ],
 )
 def test_times_that_a_file_does_not_tell_are_in_the_names(names, times):

@@ -21,7 +21,7 @@ import torch
 from torch.nn.functional import adaptive_max_pool2d, interpolate
 
 from forewarp.data.files import UNREAD
-from forewarp.data.images import SUFFIXES, common_header, in_order, read_image, write_image
+from forewarp.data.images import SUFFIXES, bright, common_header, in_order, read_image, write_image
 from forewarp.data.transforms import times_of
 from forewarp.drawing.images import at_most
 from forewarp.files import read_json, write_json
@@ -30,7 +30,6 @@ Progress = Callable[[int, int], None]
 Step = Callable[[str], object]  # title of a step -> a context manager that gives a ``Progress``
 
 TAKEN = "pictures.json"  # what was taken; written last
-_MOVING = 127  # a mask above it is what moves
 _MIN_IMAGES, _SHORT, _ENOUGH, _MOST = 3, 150, 120, 300  # frames: fewest, of a short film, of a slow one, most
 _STEP = 8.0  # pixels of 640, by which what is fast may move from one frame that is taken to the next
 _FAST, _FLOW = 0.9, 160  # quantile of an image's motion that counts; pixels of the longer side to measure it
@@ -247,7 +246,7 @@ def _from_folder(folder: Path, source: Source, size: int | None, step: Step) -> 
     """Copy images; times are even, in the order of the names.
 
     Without known poses all have one size. With them, images may lie in subfolders, and those of several
-    cameras share a time where folders and numbers tell so: see ``transforms.times_of``.
+    cameras share a time where folders or names tell so: see ``transforms.times_of``.
 
     The copies have names of ours: COLMAP's list of pairs has no place for a space, and what comes later sorts
     plainly. Alpha is kept where all images have it.
@@ -257,12 +256,14 @@ def _from_folder(folder: Path, source: Source, size: int | None, step: Step) -> 
     if len(paths) < _MIN_IMAGES:
         got = f"{len(paths)} PNG or JPEG files" if paths else "none"
         raise ValueError(f"{source.images}: expected a folder of many pictures, PNG or JPEG, but got {got}")
-    numbers, assumed = dict(zip(paths, range(len(paths)))), None
-    if any(path.parent != source.images for path in paths):
+    rows = {path: row for row, path in enumerate(paths)}
+    numbers, assumed = rows, None
+    if as_stored:
         names = [path.relative_to(source.images).with_suffix("").as_posix() for path in paths]
-        times, assumed = times_of(names, [None] * len(names), str(source.images))
-        numbers = dict(zip(paths, times))
-        paths.sort(key=numbers.get)
+        times, told = times_of(names, [None] * len(names), str(source.images))
+        if len({*times}) < len(times) or any(path.parent != source.images for path in paths):
+            numbers, assumed = dict(zip(paths, times)), told
+            paths.sort(key=numbers.get)
     has_alpha = common_header(paths, one_size=not as_stored).has_alpha
     widths, originals, sizes, times, first, brightest = [], {}, {}, {}, None, 0
     with step("reading pictures") as progress:
@@ -292,7 +293,7 @@ def _from_folder(folder: Path, source: Source, size: int | None, step: Step) -> 
             if not as_stored:
                 brightest = np.maximum(brightest, pixels[..., :3].max(-1))
             progress(done, len(paths))
-    record = _record(times, range(len(paths)), len(paths), widths, sizes, originals)
+    record = _record(times, [rows[path] for path in paths], len(paths), widths, sizes, originals)
     bars = (0.0, 0.0) if as_stored else bars_of(brightest)
     return record | {"assumed": assumed or _told(bars, "stay: crop the pictures")}
 
@@ -363,18 +364,17 @@ def _write_masks(folder: Path, masks: Path, done: dict) -> None:
         )
     in_turn = are_counted and not (are_named and originals)  # frames may be counted from 0 or from 1
     chosen = [paths[row] for row in done["rows"]] if in_turn else [by_name[stem] for stem in stems]
-    brightest = 0
+    any_moves = False
     for name, path in zip(names, chosen):
         width, height = done["sizes"][name]
-        values = read_image(path)[..., 0]
-        brightest = max(brightest, int(values.max()))
         # A pixel is kept out as soon as a part of it moves.
-        moving = adaptive_max_pool2d((values > _MOVING).float()[None, None], (height, width))[0, 0] > 0
+        moving = adaptive_max_pool2d(bright(path).float()[None, None], (height, width))[0, 0] > 0
+        any_moves |= bool(moving.any())
         write_image(folder / f"{name}.png", (255 * ~moving).byte().numpy())
-    if brightest <= _MOVING:
+    if not any_moves:
         raise ValueError(
-            f"{masks}: expected masks in which what moves is brighter than {_MOVING} of 255, but got at most "
-            f"{brightest}; write it as 255, or leave out masks="
+            f"{masks}: expected masks in which what moves is bright, but got none above 127 of 255; write it "
+            "as 255, or leave out masks="
         )
 
 

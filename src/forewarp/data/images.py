@@ -45,6 +45,10 @@ _JPEG_END, _JPEG_TAIL = b"\xff\xd9", 4096  # some cameras write a little behind 
 _LEAST_HIDDEN, _COLORS = 0.01, 64  # share of an image, and colours, that tell an image beneath
 _ROUNDED, _STRAY, _LEAST_EDGES, _EDGES_OF = 2, 0.001, 50, 4  # of an edge; share, least edges, images
 _FOREGROUND = 127  # a mask above it is foreground; masks are lossy, so never quite 0 or 255
+_COLORED = 32  # of 255: difference of channels of a mask with colours; all of a DAVIS palette are as bright
+_NUMBERED = 15  # a mask nowhere above it holds numbers of objects
+# A number in a name; seconds, as of TUM's data or ROS, are Unix time, or fill the name to the microsecond.
+_NUMBER = r"((?<!\d)\d{9,10}\.\d+|(?<![^/])\d+\.(?:\d{6}|\d{9})(?=$|\.[A-Za-z])|\d+)"
 
 
 class ImageCache:
@@ -306,7 +310,7 @@ class StoredImage:
         path: of the image.
         size: (width, height), what the files must hold.
         halve: average 2 x 2 pixels; of a cut-out an odd last row or column is cut off.
-        mask: of the same size; its first channel counts, above 127 is foreground.
+        mask: of the same size; what is foreground see ``bright``.
         opaque: leave the image's own alpha aside.
         premultiplied: colours on disk are multiplied by alpha.
     """
@@ -344,7 +348,7 @@ class StoredImage:
             rgba[..., 3] = 255
         if self.mask is None:
             return reduced(rgba) if self.halve else rgba
-        rgba *= (_bright(self.mask, self.size) & (rgba[..., 3] > 0))[..., None]
+        rgba *= (bright(self.mask, self.size) & (rgba[..., 3] > 0))[..., None]
         rgba = halved_cutout(rgba) if self.halve else rgba
         foreground = rgba[..., 3] > 0
         if not bool(foreground.any()):
@@ -355,24 +359,23 @@ class StoredImage:
 
 
 class StoredMask:
-    """A mask decoded at its first use and kept while there is room, bool (H, W), read-only: true where a
-    channel is bright.
+    """A mask decoded at its first use and kept while there is room, bool (H, W), read-only: see ``bright``.
 
     Args:
         path: of the mask.
         size: (width, height), what the file must hold.
-        channel: 0 of a mask; 3 of an image whose alpha it is.
+        of_alpha: it is the alpha of an image.
     """
 
-    def __init__(self, path: Path, size: tuple[int, int], channel: int = 0) -> None:
-        self.path, self.size, self.channel = path, size, channel
+    def __init__(self, path: Path, size: tuple[int, int], of_alpha: bool = False) -> None:
+        self.path, self.size, self.of_alpha = path, size, of_alpha
 
     def __call__(self) -> Tensor:
         """Give the mask; SceneError where it cannot be decoded, has another size or is dark everywhere."""
         return CACHE.get(self, self._decode)
 
     def _decode(self) -> Tensor:
-        mask = _bright(self.path, self.size, self.channel)
+        mask = bright(self.path, self.size, self.of_alpha)
         if not bool(mask.any()):
             expected, advice = "a mask with a bright pixel", "remove the frame, or set data.masks=off"
             raise mismatch(self.path, expected, "none above 127", advice)
@@ -386,16 +389,29 @@ class MovingMask(StoredMask):
     """
 
     def _decode(self) -> Tensor:
-        mask, shape = _bright(self.path), self.size[::-1]
+        mask, shape = bright(self.path), self.size[::-1]
         if mask.shape == shape:
             return mask
         return torch.nn.functional.interpolate(mask[None, None].float(), shape, mode="area")[0, 0] >= 0.5
 
 
-def _bright(path: Path, size: tuple[int, int] | None = None, channel: int = 0) -> Tensor:
-    """Decode where a channel is bright, (H, W) bool; masks of 0 and 1 are taken for what they are."""
-    values = read_image(path, size)[..., channel]
-    return values > (_FOREGROUND if int(values.max()) > 1 else 0)
+def bright(path: Path, size: tuple[int, int] | None = None, of_alpha: bool = False) -> Tensor:
+    """Decode what is foreground in a mask, (H, W) bool: where it is above 127; in one with colours, as a
+    palette has them for several objects, whatever is not black; in one of small numbers, whatever is not 0.
+
+    Args:
+        path: of the mask.
+        size: (width, height) that it must have; None: any.
+        of_alpha: the mask is the alpha of this image.
+
+    Raises:
+        SceneError: as ``read_image``.
+    """
+    rgba = read_image(path, size)
+    values = rgba[..., 3] if of_alpha else rgba[..., :3].amax(-1)
+    is_colored = not of_alpha and int((values - rgba[..., :3].amin(-1)).max()) >= _COLORED
+    least = _COLORED if is_colored else (_FOREGROUND + 1 if int(values.max()) > _NUMBERED else 1)
+    return values >= least
 
 
 def hides_image(rgba: Tensor) -> bool:
@@ -504,8 +520,15 @@ def in_order(things: Iterable, name: Callable[..., str] = str) -> list:
     >>> in_order(["b2", "b10", "a"])
     ['a', 'b2', 'b10']
     """
+    return sorted(things, key=lambda thing: name_parts(name(thing)))
 
-    def parts(thing) -> list:
-        return [int(part) if part.isdecimal() else part for part in re.split(r"(\d+)", name(thing))]
 
-    return sorted(things, key=parts)
+def name_parts(name: str) -> list[str | float]:
+    """Split a name into text, at even places, and numbers; seconds such as 1305031102.1753 are one number.
+
+    >>> name_parts("cam1/007"), name_parts("rgb/1305031102.1753"), name_parts("12.345678.png")
+    (['cam', 1, '/', 7, ''], ['rgb/', 1305031102.1753, ''], ['', 12.345678, '.png'])
+    """
+    parts = re.split(_NUMBER, name)
+    parts[1::2] = (float(part) if "." in part else int(part) for part in parts[1::2])
+    return parts

@@ -284,7 +284,7 @@ def _read_entries(
                 image, "a mask_path or alpha, as data.masks=ignore", "neither", "set data.masks=null"
             )
         if masks != "alpha" and (mask or masks == "ignore"):
-            valid = StoredMask(mask or image, header.size, 0 if mask else 3)
+            valid = StoredMask(mask or image, header.size, of_alpha=mask is None)
             valid()  # refuses a mask without a bright pixel
         opaque = masks == "off" or (masks == "ignore" and mask is None)
         load = StoredImage(image, header.size, mask=None if valid else mask, opaque=opaque)

@@ -21,7 +21,7 @@ import torch
 
 from forewarp.data.cameras import FLIP, check_lens, check_middle, pose_of
 from forewarp.data.files import Entry, mismatch, nearly
-from forewarp.data.images import SUFFIXES, TURN, by, in_order
+from forewarp.data.images import SUFFIXES, TURN, by, in_order, name_parts
 from forewarp.scene.camera import Camera, Lens
 
 Thing = TypeVar("Thing")
@@ -295,7 +295,7 @@ def times_of(
     if any(given):
         got = f"{sum(given)} of {len(given)}, and none for {names[given.index(False)]}"
         raise mismatch(f"{where}: frames: time", "one in all frames or in none", got)
-    numbers = _numbers(names)
+    numbers = numbers_in(names)
     if numbers is None:
         order = in_order(range(len(names)), lambda i: names[i])
         ranks = {i: rank for rank, i in enumerate(order)}
@@ -306,7 +306,7 @@ def times_of(
     line = f"{where}: no time in the frames: taken from the numbers in the images' names, {first} to {last}"
     if len(set(numbers)) < len(numbers):
         line += "; images of one number share a time"
-    return [(number - first) / max(last - first, 1) for number in numbers], line
+    return [(number - first) / ((last - first) or 1) for number in numbers], line
 
 
 def check_times(splits: Mapping[str, Mapping[str, float | None]], where: str) -> None:
@@ -352,9 +352,9 @@ def _within_unit(times: Iterable[float]) -> bool:
     return all(-_ROUNDING <= time <= 1 + _ROUNDING for time in times)
 
 
-def _numbers(names: Sequence[str]) -> list[int] | None:
-    """Return each name's frame number; None where names do not tell."""
-    parts = [re.split(r"(\d+)", name) for name in names]
+def numbers_in(names: Sequence[str]) -> list[float] | None:
+    """Return each name's frame number, or its seconds; None where names do not tell."""
+    parts = [name_parts(name) for name in names]
     if len({len(part) for part in parts}) > 1:
         parts = [part[-3:] if len(part) >= 3 else part for part in parts]  # folders may be called differently
         if any(len(part) < 3 for part in parts):
@@ -363,7 +363,7 @@ def _numbers(names: Sequence[str]) -> list[int] | None:
     frames = [i for i in places if not all(_CAMERA_WORDS.search(part[i - 1]) for part in parts)]
     if not frames:
         return None
-    numbers = [int(part[frames[-1]]) for part in parts]
+    numbers = [part[frames[-1]] for part in parts]
     others = [
         tuple(name.split("/")[:-1]) + tuple(p for i, p in enumerate(part) if i != frames[-1])
         for name, part in zip(names, parts)
