@@ -358,6 +358,29 @@ def test_point_clouds_in_millimetres_have_one_line_with_a_key_that_is_there(tmp_
     assert lines[0].endswith("mend the point clouds, or set data.box=[x0,y0,z0,x1,y1,z1]")
 
 
+@pytest.mark.parametrize(("factor", "doubted"), [(1, False), (300, True)])
+def test_a_box_far_wider_than_all_cameras_is_told_by_name(tmp_path, factor, doubted):
+    """Clouds around the point that all cameras look at, which alone shows nothing wrong."""
+    folder = write_dome(tmp_path / "toy")
+    for path in folder.glob("pointclouds/*.npy"):
+        cloud = np.load(path)
+        cloud[:, :3] = [0.1, 0.05, 0.9] + factor * 0.2 * np.random.default_rng(0).uniform(
+            -1, 1, (len(cloud), 3)
+        )
+        np.save(path, cloud)
+    lines = list(remarks(nhr.read_scene(tmp_path, "toy")))
+    said = [line for line in lines if "times as wide as the ring of all cameras, as if point clouds" in line]
+    assert len(said) == doubted
+
+
+@pytest.mark.parametrize(("shift", "doubted"), [(0.0, False), (1.0, True)])
+def test_test_times_beyond_those_of_training_are_told(shift, doubted):
+    train = tuple(replace(f, time=f.time / 2) for f in SCENE.train)
+    test = tuple(replace(f, time=0.1 + shift / 2 + f.time / 4) for f in SCENE.train)
+    lines = list(remarks(changed(train=train, test=test)))
+    assert ["lie outside training's, 0 to 0.5, of which" in line for line in lines] == [True] * doubted
+
+
 def test_all_cameras_of_a_long_walk_are_asked_for_points_at_no_cost_of_their_size(monkeypatch):
     """Cameras every metre along a street look across; points are 3 m away; masks of 12 Mpx are not made."""
     up, frames, bytes_of = torch.tensor([0.0, 0.0, 1.0]), [], []

@@ -104,6 +104,26 @@ def test_time_id_counts_before_warp_id_and_entries_of_no_item_not_at_all(tmp_pat
     assert read_scene(tmp_path, "toy").test[0].time == 0.25
 
 
+def test_names_tell_the_moment_where_warp_id_counts_one_camera_after_the_other(tmp_path):
+    file = write_rig(tmp_path / "toy", rig()) / "metadata.json"
+    expected = {f.name: f.time for f in (lambda s: (*s.train, *s.test))(read_scene(tmp_path, "toy"))}
+
+    def counted(order):
+        for entry in (content := json.loads(file.read_text())).values():
+            entry.pop("time_id", None)
+        for number, item in enumerate(order(content)):
+            content[item]["warp_id"] = number
+        file.write_text(json.dumps(content))
+        return read_scene(tmp_path, "toy")
+
+    scene = counted(sorted)
+    assert {f.name: f.time for f in (*scene.train, *scene.test)} == pytest.approx(expected)
+    (line,) = scene.protocol["assumed"]
+    assert "warp_id counts the items of one camera after the other: times are the numbers in their" in line
+    # In the order of the moments it may be right, as of cameras that take turns.
+    assert "assumed" not in counted(lambda items: sorted(items, key=lambda i: i.split("_")[1])).protocol
+
+
 def test_time_ids_in_two_units_and_of_one_moment_are_named(tmp_path):
     folder = write_rig(tmp_path / "toy", rig(times=24))
     val = json.loads((folder / "dataset.json").read_text())["val_ids"]

@@ -23,6 +23,7 @@ _WITHIN = 5  # points along a side of the box that cameras are asked for
 _FAINT = 8  # of 255: alpha that is nowhere above it was written as 0 and 1
 _WIDEST, _ZOOMED = 130, 1.25  # degrees of a pinhole camera; focal lengths of test and training images
 _STRETCHED, _SAME_PLACE = 1.25, 1e-9  # sides of a pixel; share of the cameras' distance from the origin
+_AROUND = 2  # half a side of a subject's box in distances of the farthest camera from what they look at
 _CUT_OFF, _FEW = 0.1, 0.5  # share of the subject beyond the box; of pixels and points that is too few
 # What mends near or far, the box, and all three, by format; "" is any other.
 _REMEDIES = {
@@ -40,9 +41,10 @@ _REMEDIES = {
 def remarks(scene: Scene) -> Iterator[str]:
     """Say what in a scene is probably not what was meant, a line each, with what mends it.
 
-    That is a range or box without the point that all cameras look at, or without a part of the subject;
-    inverted, empty or opaque alpha and masks; masks that leave little; points that no camera sees; cameras in
-    one place, no pinholes, or of test images in other units.
+    That is a range or box without the point that all cameras look at, or without a part of the subject, or
+    one far wider than all cameras; inverted, empty or opaque alpha and masks; masks that leave little; points
+    that no camera sees; cameras in one place, no pinholes, or of test images in other units; test images of
+    times beyond those of training.
 
     Raises:
         SceneError: if no training image shows anything.
@@ -50,8 +52,16 @@ def remarks(scene: Scene) -> Iterator[str]:
     Cost: eight training images are decoded, which training does anyway; all, where those show nothing.
     """
     aim = common_point([frame.camera.camera_to_world for frame in scene.train])
-    aside = list(_pinholes(scene)) or ([] if aim is None else list(_aimed(scene, aim)))
+    aside = list(_pinholes(scene)) or list(_too_wide(scene, aim))
+    aside = aside or ([] if aim is None else list(_aimed(scene, aim)))
     yield from aside or _of_test_images(scene)
+    beyond = [frame.time for frame in scene.test if not scene.times[0] <= frame.time <= scene.times[-1]]
+    if scene.test and len(beyond) == len(scene.test):
+        yield (
+            f"all test times, {min(beyond):.4g} to {max(beyond):.4g}, lie outside training's, "
+            f"{scene.times[0]:.4g} to {scene.times[-1]:.4g}, of which alone motion is learnt; give images of "
+            "one moment one time"
+        )
     if scene.has_alpha:
         yield from _silhouettes(scene, bounded=not aside)
     if masked := [frame.load_valid for frame in scene.train if frame.load_valid is not None]:
@@ -86,6 +96,21 @@ def _pinholes(scene: Scene) -> Iterator[str]:
     if (degrees := math.degrees(2 * math.atan(widest / 2))) > _WIDEST:
         line = f"training images are {degrees:.0f} degrees wide, as if focal lengths were in millimetres"
         yield f"{line}; write them in pixels"
+
+
+def _too_wide(scene: Scene, aim: Tensor | None) -> Iterator[str]:
+    """Say that the box of a cut-out subject is far wider than the ring of cameras around the point (3,) that
+    they look at, or else around its middle.
+    """
+    middle = torch.tensor(scene.box.center, dtype=torch.float64) if aim is None else aim
+    ring = max(float((frame.camera.center - middle).norm()) for frame in scene.train)
+    half = min(high - low for low, high in zip(scene.box.low, scene.box.high)) / 2
+    if scene.has_alpha and half > _AROUND * ring:
+        what = "point clouds were" if scene.protocol.get("dataset") == "nhr" else "it were"
+        yield (
+            f"the box {bounds(scene)} is {half / max(ring, _SAME_PLACE):.3g} times as wide as the ring of "
+            f"all cameras, as if {what} in another unit; {_remedy(scene, 'box')}"
+        )
 
 
 def _of_test_images(scene: Scene) -> Iterator[str]:

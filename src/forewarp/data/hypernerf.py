@@ -35,7 +35,7 @@ from forewarp.data.cameras import (
 from forewarp.data.directions import by_translation, opposite, other_readings, transposed
 from forewarp.data.files import Entry, inside, mismatch, number, read_json, remove, scene_folder, whole
 from forewarp.data.images import StoredImage, check_pixels, inspect_image, turned_by_exif, write_image
-from forewarp.data.transforms import check_pinhole, check_times, with_images, with_suffix
+from forewarp.data.transforms import check_pinhole, check_times, numbers_in, with_images, with_suffix
 from forewarp.files import write_json
 from forewarp.scene.camera import Camera, Lens
 from forewarp.scene.frame import Frame, Scene, Truth, middle_of
@@ -94,10 +94,11 @@ def read_scene(root: str | Path, scene: str, *, scale: int = 2, box: Sequence[fl
         raise mismatch(f"{world.file}: near, far", "near < far", f"{near:g} and {far:g}")
     normalised = Normalisation(center, size, near, far)
     how, ids, train_ids, test_ids = _read_split(folder / "dataset.json")
-    times, camera_ids, numbers = _read_items(folder / "metadata.json", ids)
+    times, camera_ids, numbers, assumed = _read_items(folder / "metadata.json", ids)
     where = f"{folder / 'dataset.json'}: ids"
     paths = {item: with_suffix(inside(images, item, where)) for item in ids}
-    there, assumed = with_images(ids, list(paths.values()), where)
+    there, told = with_images(ids, list(paths.values()), where)
+    assumed += told
     train_ids, test_ids = ([item for item in part if item in set(there)] for part in (train_ids, test_ids))
     for part, names in (("train_ids", train_ids), ("val_ids", test_ids)):
         if not names:
@@ -281,12 +282,15 @@ def _read_split(path: Path) -> tuple[str, list[str], list[str], list[str]]:
     return "interpolation", ids, [ids[i] for i in chosen], [ids[i + _EVERY // 2] for i in chosen[:-1]]
 
 
-def _read_items(path: Path, ids: list[str]) -> tuple[dict[str, float], dict[str, int | None], dict[str, int]]:
+def _read_items(
+    path: Path, ids: list[str]
+) -> tuple[dict[str, float], dict[str, int | None], dict[str, int], list[str]]:
     """Read the time in [0, 1] of each item of a ``metadata.json``, its camera's number, where it has one, and
-    the number of its moment.
+    the number of its moment; also say in lines what was assumed.
 
     The time is ``time_id``, or where none of ``ids`` has one ``warp_id``, between the least and the greatest
-    of them. Entries of other items are not looked at.
+    of them; where that only counts the items, one camera after the other, the number in their names. Entries
+    of other items are not looked at.
 
     Raises:
         SceneError: for an item that is missing or has no time, and for a number that is not whole.
@@ -306,10 +310,32 @@ def _read_items(path: Path, ids: list[str]) -> tuple[dict[str, float], dict[str,
             if number % 1:
                 raise mismatch(entry.where(name), "a whole number", f"{number:g}")
             numbers[name][item] = int(number)
-    first, last = min(numbers[key].values()), max(numbers[key].values())
-    span = max(last - first, 1)
-    times = {item: (number - first) / span for item, number in numbers[key].items()}
-    return times, numbers["camera_id"], numbers[key]
+    moments, assumed = numbers[key], []
+    named = dict(zip(ids, numbers_in(ids) or []))
+    if key == "warp_id" and _counts_items(moments, named, numbers["camera_id"]):
+        moments = named
+        said = "counts the items of one camera after the other: times are the numbers in their names"
+        assumed = [f"{path}: warp_id {said}; write time_id if they are wrong"]
+    first, last = min(moments.values()), max(moments.values())
+    span = (last - first) or 1
+    times = {item: (number - first) / span for item, number in moments.items()}
+    return times, numbers["camera_id"], moments, assumed
+
+
+def _counts_items(warps: dict[str, int], named: dict[str, float], cameras: dict[str, int | None]) -> bool:
+    """Tell whether ``warp_id`` says nothing of the moment: it differs everywhere, while names give items of
+    several cameras one number, and it does not grow with that.
+    """
+    pairs = {(number, cameras[item]) for item, number in named.items()}
+    if (
+        not named
+        or None in cameras.values()
+        or len(pairs) < len(named)
+        or len({*warps.values()}) < len(warps)
+    ):
+        return False
+    in_turn = [named[item] for item in sorted(named, key=warps.get)]
+    return in_turn != sorted(in_turn)
 
 
 def _write_shot(folder: Path, shot: RigShot, scales: Sequence[int]) -> None:
