@@ -16,6 +16,7 @@ import torch
 
 from forewarp import load
 from forewarp.drawing.images import to_bytes
+from forewarp.evaluation.layers import LAYERS, layer_of
 from forewarp.export.glb import packed_scene
 from forewarp.export.html import _PLAYER, page, poster
 from forewarp.export.tracks import Source
@@ -27,7 +28,7 @@ from forewarp.scene.view import Moment, View
 from tests.export.conftest import TIMES, exporter
 from tests.glb.test_meshopt import elements
 from tests.support.browser import Tab, chromium, until
-from tests.support.particles import BARE, module_with, small_data
+from tests.support.particles import BARE, EVERY, module_with, small_data
 
 export = exporter("html", quality="lossless", seconds=2.0)
 ATTACK = "\"'><img src=x onerror=attacked=1></script><script>attacked=1</script> {{scene}} – Ünï\u2028🙂"
@@ -183,16 +184,31 @@ def test_what_is_shown_follows_the_address(particles, opened):
 
 @pytest.mark.browser
 @pytest.mark.slow
-def test_layers_together_are_the_scene(particles, opened):
-    tab, method = opened(), particles.method
-    camera, moves = cameras_of(particles)[1].resized(100, 100), method.skinning.weights().sum(-1) > 0
+def test_layers_are_those_of_the_run(browser, tmp_path):
+    data = small_data()
+    module = module_with(data, **EVERY)
+    nodes, frames, name = module.method.nodes, data.scene.train, tmp_path / "html"
+    right = nodes.positions[:, 0] > nodes.positions[:, 0].median()
+    nodes.translations.data[right] += torch.linspace(-0.6, 0.6, nodes.curve.count)[:, None]
+    times = [frame.time for frame in frames]
+    source = Source(module, "particles", [f.camera for f in frames], TIMES, image_times=times)
+    export(source, name)
+    tab = Tab(browser, None, width=320, height=320)
+    tab.page.goto((name / "scene.html").as_uri())
+    counts = state(tab, "scene.count", "scene.moving", "scene.inMotion")
+    assert counts[0] >= counts[1] > counts[2] > 0
+    tab.page.keyboard.press("v")
+    assert tab.page.locator("#layers").is_visible()
     asked = {"width": 100, "height": 100, "time": 0.4, "camera": 1}
-    for layer, which in (("moving", moves), ("resting", ~moves), ("all", moves | ~moves)):
-        kept = method.opacity.data.clone()
-        method.opacity.data[~which] = -30.0
-        wanted = rendered(particles, camera, 0.4)
-        method.opacity.data.copy_(kept)
-        assert psnr(drawn(tab, particles, layer=layer, **asked), wanted) > 50
+    camera = cameras_of(source)[1].resized(100, 100)
+    for layer in LAYERS:
+        method = layer_of(module.method, layer, frames)
+        image = method.at(Moment(0.4)).render(View(camera), torch.ones(3)).rgb.detach()
+        wanted = image.reshape(100, 100, 3).clamp(max=1)
+        assert psnr(drawn(tab, source, layer=layer, **asked), wanted) > 50
+        assert float((1 - wanted).max()) > 0.1
+    assert tab.errors == []
+    tab.page.close()
 
 
 @pytest.mark.browser

@@ -16,7 +16,7 @@ uniform float near, margin, blur;
 uniform vec3 radial; // of the lens
 uniform vec2 tangential;
 uniform float reach; // squared distance from the axis from which on the lens shows nothing
-uniform int count, moving, layer;
+uniform int count, moving, inMotion, layer;
 uniform float basis[TIMES];
 uniform highp usampler2D order;
 layout(location = 0) out uvec4 outA; // pixel, and the longer axis of the ellipse, pixels
@@ -32,8 +32,8 @@ void main() {
   cell = ivec2(i % ROW, i / ROW);
   outA = uvec4(0);
   outB = uvec4(0, floatBitsToUint(-1e9), 0, 0);
-  bool moves = i < moving;
-  if (here.y * ROW + here.x >= count || layer == 1 && !moves || layer == 2 && moves) return;
+  bool moves = i < moving, goes = i < inMotion; // by nodes; by more than images show
+  if (here.y * ROW + here.x >= count || layer == 1 && !goes || layer == 2 && goes) return;
 
   vec4 place = of(0), q = normalize(of(1));
   mat3 linear = mat3(1);
@@ -452,6 +452,7 @@ class Renderer {
     gl.uniform1f(project.place("reach"), reachOf(view));
     gl.uniform1i(project.place("count"), scene.count);
     gl.uniform1i(project.place("moving"), scene.moving);
+    gl.uniform1i(project.place("inMotion"), scene.inMotion);
     gl.uniform1i(project.place("layer"), LAYERS.indexOf(layer));
     gl.uniform1fv(project.place("basis"), this.basis);
     this.bind(project, "particles", 0, this.particles, gl.TEXTURE_2D_ARRAY);
@@ -535,7 +536,7 @@ function spread(list, count) {
 // Return the paths of some opaque particles that go some way, as segments for ``setTrails``. Particles lie in
 // the file along a curve that fills space, so that every n-th one is about evenly spread.
 function trailsOf(scene) {
-  const solid = [...Array(scene.moving).keys()].filter((i) => scene.opacity[i] > TRAIL_OPACITY);
+  const solid = [...Array(scene.inMotion).keys()].filter((i) => scene.opacity[i] > TRAIL_OPACITY);
   const tried = spread(solid, 5 * TRAIL_POINTS);
   const pick = (values, width) => {
     const out = new Float32Array(width * tried.length);

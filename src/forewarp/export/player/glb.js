@@ -181,7 +181,8 @@ function readScene(bytes) {
     for (const [group, j] of at) group[j] /= sum;
   }
   return {
-    count: places.length / 3, moving: nodes ? motion.moving : 0, places, harmonics, weights,
+    count: places.length / 3, moving: nodes ? motion.moving : 0,
+    inMotion: nodes ? motion.inMotion ?? motion.moving : 0, places, harmonics, weights,
     quaternions: read(named[`${SPLATS}:ROTATION`]), scales: read(named[`${SPLATS}:SCALE`]),
     opacity: read(named[`${SPLATS}:OPACITY`]), logits: motion.opacityLogits === undefined ? null : read(motion.opacityLogits),
     links: (motion.links ?? []).map(read), curve: motion.curve,

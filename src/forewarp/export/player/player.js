@@ -313,9 +313,9 @@ function connect(player) {
   const click = (id, action) => byId(id).addEventListener("click", action);
   const home = () => player.look(0), next = () => player.look((player.camera + 1) % player.scene.cameras.length);
   const toggleHelp = () => {
-    const { count, moving } = player.scene, { bits } = player.renderer;
+    const { count, inMotion } = player.scene, { bits } = player.renderer;
     const sorted = player.sorting.milliseconds.toFixed(1);
-    byId("about").textContent = `${count.toLocaleString("en")} particles, of which ${moving.toLocaleString("en")} move; ` +
+    byId("about").textContent = `${count.toLocaleString("en")} particles, of which ${inMotion.toLocaleString("en")} move; ` +
       `blended in ${bits} bits, sorted in ${sorted} ms`;
     if (keys.open) keys.close();
     else keys.showModal();
@@ -330,7 +330,7 @@ function connect(player) {
   };
   byId("whole").hidden = !document.fullscreenEnabled;
   byId("camera").hidden = player.scene.cameras.length < 2;
-  byId("layers").hidden = !player.scene.moving || player.scene.moving === player.scene.count;
+  byId("layers").hidden = !player.scene.inMotion || player.scene.inMotion === player.scene.count;
   for (const name of ["play", "time", "clock", "trails"]) byId(name).disabled = !player.scene.moving;
   click("play", () => player.play(!player.playing));
   click("home", home);
