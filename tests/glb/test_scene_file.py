@@ -3,6 +3,7 @@
 import json
 import math
 import struct
+import tracemalloc
 from dataclasses import fields, replace
 
 import numpy as np
@@ -268,6 +269,8 @@ WRONG = {
     "more that move": (in_motion("moving", 10**5), "moving: expected a whole number from 0 to"),
     "an unknown curve": (in_motion("curve", "kind", "bezier"), "kind: expected spline or cosines"),
     "a curve of other length": (in_motion("curve", "count", 9), "translations: expected"),
+    "far too many links": (in_motion("links", [1] * 17), "links: expected a list of at most 16, but got"),
+    "far too many cosines": (in_motion("colorOverTime", [8] * 65), "expected a list of at most 64"),
     "another cutoff": (in_motion("cutoff", 0.01), "cutoff: expected 0.00392157, but got 0.01"),
     "no nodes": (in_motion("nodes", None), "nodes: expected an object, but got None"),
     "no weights": (in_motion("weights", []), "weights: expected accessors, but got none"),
@@ -297,6 +300,20 @@ def test_a_file_with_a_mistake_is_refused_by_name(every, kept, change, says):
     assert len(text) < 300 + len(str(path))
 
 
+@pytest.mark.parametrize("name", ["absurd counts", "an absurd view", "a large view", "too many rows"])
+def test_what_a_file_claims_takes_no_memory(every, kept, name):
+    description, binary = unpacked(written(every, COMPACT))
+    WRONG[name][0](description)
+    path = kept(packed(description, binary))
+    tracemalloc.start()
+    try:
+        with pytest.raises(ValueError, match=r"scene\.glb: "):
+            read(path)
+        assert tracemalloc.get_traced_memory()[1] < 1 << 22
+    finally:
+        tracemalloc.stop()
+
+
 @pytest.mark.parametrize(
     ("made", "says"),
     [
@@ -313,6 +330,7 @@ def test_a_file_with_a_mistake_is_refused_by_name(every, kept, change, says):
         (lambda data: packed(b'{"nodes": NaN}', b""), "expected JSON, but got 'the number NaN'"),
         (lambda data: packed(b'{"a": ' + b"9" * 5000 + b"}", b""), "expected JSON, but"),
         (lambda data: packed(b"[]", b""), "glTF: expected an object, but got []"),
+        (lambda data: packed(b" " * (1 << 21), b""), "expected at most 1048576 bytes of JSON"),
         (lambda data: struct.pack("<4sII", b"glTF", 2, 12), "expected a chunk of JSON and one of arrays"),
     ],
 )

@@ -14,7 +14,7 @@ import torch
 
 from forewarp.fields.curves import KINDS, PADDING, Curve
 from forewarp.fields.moving import MARGIN, MovingGaussians, NodeMotion
-from forewarp.files import MOST_ARRAYS
+from forewarp.files import MOST_ARRAYS, MOST_CONFIG, read_bytes
 from forewarp.glb import meshopt
 from forewarp.glb.container import CHUNKS, COMPONENTS, COMPRESSION, ELEMENTS, MAGIC, VERSION
 from forewarp.glb.writer import FORMAT, MOTION, SPLATS, Setting
@@ -23,7 +23,8 @@ from forewarp.scene.camera import Camera, Lens
 
 _KNOWN = {COMPRESSION, SPLATS, MOTION}  # extensions that a file may require
 FEATURES: frozenset[str] = frozenset()  # names that a file may list of what a reader must know
-_DEGREES = 3  # of the harmonics, at most
+# At most: degree of the harmonics, cosines over time, accessors of links.
+_DEGREES, _COSINES, _LINKS = 3, 64, 16
 FARTHEST = 0.2  # of all time: no image's time is off by more
 _ONE_FILTER = {"NONE": None, "EXPONENTIAL": None, "QUATERNION": 8}  # the stride that a filter asks for
 
@@ -83,9 +84,10 @@ class Fields:
         """Return true or false."""
         return self._get(key, "true or false", lambda v: isinstance(v, bool), default)
 
-    def items(self, key: str, default: list | None = None) -> list:
-        """Return a list."""
-        return self._get(key, "a list", lambda v: isinstance(v, list), default)
+    def items(self, key: str, default: list | None = None, most: int = MOST_CONFIG) -> list:
+        """Return a list of at most so many."""
+        good = lambda v: isinstance(v, list) and len(v) <= most  # noqa: E731
+        return self._get(key, f"a list of at most {most}", good, default)
 
     def parts(self, key: str) -> list[Fields]:
         """Return a list of parts; none if it is missing."""
@@ -129,6 +131,8 @@ class Container:
         text, binary = (chunks.get(kind) for kind in CHUNKS)
         if text is None or binary is None:
             raise ValueError("expected a chunk of JSON and one of arrays, but got others")
+        if len(text) > MOST_CONFIG:
+            raise ValueError(f"expected at most {MOST_CONFIG} bytes of JSON, but got {len(text)}")
         self.description, self.binary = Fields(_parsed(bytes(text)), "glTF"), binary
         self.accessors, self.views = (self.description.parts(key) for key in ("accessors", "bufferViews"))
         self._decoded: dict[int, np.ndarray] = {}
@@ -240,11 +244,8 @@ def read(path: Path) -> Contents:
 
     Cost: about a microsecond for each 16 bytes of compressed arrays.
     """
-    with path.open("rb") as file:
-        data = file.read(MOST_ARRAYS + 1)
+    data = read_bytes(path, MOST_ARRAYS)
     try:
-        if len(data) > MOST_ARRAYS:
-            raise ValueError(f"expected at most {MOST_ARRAYS} bytes, but got more")
         return _scene(Container(data))
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
@@ -314,7 +315,7 @@ def _gaussians(container: Container, attributes: Fields, motion: Fields) -> Movi
         degree += 1
 
     def over_time(key: str, kind: str) -> torch.Tensor | None:
-        numbers = motion.items(key, [])
+        numbers = motion.items(key, [], most=_COSINES)
         parts = [container.array(n, kind, count, place=f"{MOTION}.{key}") for n in numbers]
         return torch.from_numpy(np.stack(parts, 1).astype(np.float32)) if parts else None
 
@@ -373,7 +374,7 @@ def _links(
     """Read the nodes (N, L) that those that move follow, and their shares, which sum to 1."""
     tables = []
     for key in ("links", "weights"):
-        numbers = motion.items(key)
+        numbers = motion.items(key, most=_LINKS)
         parts = [container.array(n, "VEC4", moving, place=f"{MOTION}.{key}") for n in numbers]
         if not parts:
             raise ValueError(f"{MOTION}.{key}: expected accessors, but got none")
