@@ -446,6 +446,28 @@ def test_hdr_comes_back_as_the_sdr_it_was_made_from(tmp_path, transfer):
 
 
 @pytest.mark.parametrize(
+    ("tags", "bits", "told"),
+    [
+        ("color_primaries=bt2020:colorspace=bt2020nc", 10, True),
+        ("colorspace=bt2020nc", 12, True),
+        ("color_primaries=bt2020:colorspace=bt2020nc", 8, False),
+        ("color_primaries=bt2020:colorspace=bt2020nc:color_trc=bt2020-10", 10, False),
+        ("color_primaries=bt709:colorspace=bt709", 10, False),
+    ],
+)
+def test_what_may_be_hdr_but_does_not_say_so_is_told(tmp_path, tags, bits, told):
+    film, depth = tmp_path / "a.mkv", "" if bits == 8 else f"{bits}le"
+    options = [word for tag in tags.split(":") for word in f"-{tag}".split("=")]
+    made = ["-f", "lavfi", "-i", "testsrc=s=64x48:r=4:d=1", "-vf", f"format=yuv420p{depth},setparams={tags}"]
+    call = [imageio_ffmpeg.get_ffmpeg_exe(), "-v", "error", *made, *options, "-c:v", "ffv1", str(film)]
+    subprocess.run(call, check=True)
+    shown = take(tmp_path, Source(video=film), lambda title: nullcontext(quiet), count=3, size=None).assumed
+    assert (shown or "").startswith(
+        "10 bits or more of BT.2020 without a transfer are taken for SDR;"
+    ) == told
+
+
+@pytest.mark.parametrize(
     ("size", "weights", "tag"),
     [
         ((64, 48), (0.299, 0.114), None),

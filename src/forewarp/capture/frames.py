@@ -46,6 +46,10 @@ _DURATION = re.compile(r"Duration: (\d+):(\d+):([\d.]+)")
 _DAMAGE = re.compile("partial file|ended prematurely|corrupt")
 _HDR = {"arib-std-b67": "HLG", "smpte2084": "PQ"}
 _TRANSFER = re.compile(r"Video: .*\b(" + "|".join(_HDR) + r")\b")
+# Of more than 8 bits, with matrix/primaries/transfer of which one of the first is BT.2020's, the last none.
+_UNSAID = re.compile(
+    r"Video: .*p0?1[0-6](?:le|be)?\((?:[^)]*, ?)?(?:bt2020\w*/[\w-]+|[\w-]+/bt2020)/(?:unknown|reserved)\b"
+)
 # The tags of a stream, and its size; a matrix of colours stands first in its tag.
 _TAGS = re.compile(r"Video: [^,]*, \w+(?:\(([^)]*)\))?, (\d+)x(\d+)")
 _MATRIX = re.compile(r"\b(?<!/)(bt|smpte|fcc|gbr|ycg|ictcp)")
@@ -164,6 +168,10 @@ def _from_video(
     assumed = _told(bars, "are cut off")
     if source.masks is not None:
         assumed, bars = _told(bars, "stay, as masks= are of whole frames"), (0.0, 0.0)
+    if hdr_unsaid(video):
+        told = "10 bits or more of BT.2020 without a transfer are taken for SDR; if colours look faded, tag "
+        told += "it as HLG (ffmpeg -i IN -c copy -color_trc arib-std-b67 OUT.mp4) or PQ (smpte2084)"
+        assumed = f"{assumed}; {told}" if assumed else told
     transfer = hdr_of(video)
     changed = [f"{_HDR[transfer]}, tone-mapped to SDR"] if transfer else []
     changed += ["interlaced, made whole"] if _whole(video) else []
@@ -543,6 +551,11 @@ def hdr_of(video: Path) -> str | None:
     """Return ffmpeg's name of the transfer of an HDR video, HLG or PQ; None: it is SDR."""
     match = _TRANSFER.search(_header(video))
     return match and match[1]
+
+
+def hdr_unsaid(video: Path) -> bool:
+    """Tell whether a video may be HDR, by 10 bits and BT.2020, but does not say its transfer."""
+    return _UNSAID.search(_header(video)) is not None
 
 
 def _whole(video: Path) -> str:
