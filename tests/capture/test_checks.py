@@ -3,6 +3,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from scipy.spatial.transform import Rotation
 
 pytest.importorskip("pycolmap", reason="no pycolmap; make install adds it")
@@ -10,6 +11,7 @@ pytest.importorskip("pycolmap", reason="no pycolmap; make install adds it")
 from forewarp.capture import poses as checks
 from forewarp.capture.frames import Frames
 from forewarp.capture.poses import Evidence, refuse_matches, refuse_poses, unrotated
+from forewarp.data.directions import inverted, opposite
 from forewarp.scene.camera import Lens
 from tests.support.captures import cameras_on_arc, sparse_arc
 
@@ -78,6 +80,32 @@ def test_bad_poses_are_refused_with_advice(monkeypatch, found, given, says):
     monkeypatch.setattr(checks, "evidence_of", lambda database: GOOD)
     with pytest.raises(ValueError, match=says):
         refuse_poses(None if found is None else sparse_arc(**found), frames(**given), Path("database.db"))
+
+
+def placed_anew(change, **options):
+    """A known model, its poses (12, 4, 4) changed, without points."""
+    found = sparse_arc(**options)
+    poses = change(torch.stack([camera.camera_to_world for camera in found.cameras.values()]))
+    cameras = {
+        name: replace(camera, camera_to_world=pose)
+        for (name, camera), pose in zip(found.cameras.items(), poses)
+    }
+    return replace(found, cameras=cameras, points=found.points[:0], seen=found.seen[:0])
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (inverted, r"colmap: .* look at one thing only if they are camera-to-world \(invert them\); write"),
+        (opposite, "only if their axes are OpenGL's .*; write them anew, or force=true if they are right"),
+        (lambda poses: poses[:1].expand(12, 4, 4), "colmap: expected cameras that move, but got all in one"),
+    ],
+)
+def test_known_poses_of_another_kind_are_refused_before_a_scene_is_written(change, says):
+    refuse_poses(placed_anew(lambda poses: poses), frames())
+    with pytest.raises(ValueError, match=says):
+        refuse_poses(placed_anew(change), frames())
+    refuse_poses(placed_anew(change), frames(), force=True)
 
 
 @pytest.mark.parametrize(("moves", "least", "most"), [(0.0, 0.0, 1e-6), (0.002, 0, 0.06), (0.3, 0.08, 1.0)])

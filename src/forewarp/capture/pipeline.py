@@ -52,7 +52,7 @@ def capture(
         frames: to choose from a video; None: see ``frames.frames_for``, and twice as many where these do not
             register.
         size: most pixels of the longer side; with poses that are known images are left as stored.
-        force: go on where matches say that the camera stands or only turns.
+        force: go on where matches say that the camera stands or only turns, or known poses seem wrong.
 
     Raises:
         ValueError: where nothing good comes of it, with advice; frames, features and matches stay.
@@ -82,7 +82,7 @@ def capture(
                 options = {"size": size, "threads": search.threads, "why": _AGAIN}
                 images = take(work, source, step, count=more, **options)
                 found = find_poses(work, images, search, step, force)
-        refuse_poses(found, images)
+        refuse_poses(found, images, force=force)
         found = scene.placed(found)
         limits = scene.limits_of(found)
         with step("what moves, writing") as progress, folder_written_whole(out, ABOUT) as folder:

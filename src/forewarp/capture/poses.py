@@ -13,6 +13,7 @@ import torch
 
 from forewarp.capture.frames import Frames, Progress
 from forewarp.data.cameras import check_lens
+from forewarp.data.directions import inverted, opposite, other_readings
 from forewarp.data.files import SceneError
 from forewarp.scene.camera import Camera, Lens
 
@@ -37,6 +38,11 @@ _BURNT_SHARE, _BURNT_LEAST, _BURNT_MATCHES = 0.04, 5, 0.5
 _BURNT_MOST = 0.3  # share of the image: more than that is the world behind something that moves
 # Camera models of Brown's distortion; a ``k`` of another, as of SIMPLE_DIVISION, is another lens.
 _MODELS = {"SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV"}
+_READINGS = {  # what else may be in a model
+    "they are camera-to-world (invert them)": inverted,
+    "their axes are OpenGL's (negate the camera's y and z)": opposite,
+}
+_SAME_PLACE = 1e-6  # of the distance from the origin; models have six digits or more
 _PLACES = ("", "sparse/0", "sparse", "colmap/sparse/0")  # of a model in a folder that is given
 _PARAMETERS = {"f", "fx", "fy", "cx", "cy", "k", "k1", "k2", "k3", "p1", "p2"}
 
@@ -510,13 +516,19 @@ class TooFewRegistered(ValueError):
     """Poses of too few images were found; of a film, more frames may help."""
 
 
-def refuse_poses(found: Reconstruction | None, frames: Frames, database: Path | None = None) -> None:
+def refuse_poses(
+    found: Reconstruction | None, frames: Frames, database: Path | None = None, force: bool = False
+) -> None:
     """Refuse poses of too few images, of a fisheye, of cameras that hardly move, and those that do not fit.
+
+    Known poses without points in front of them are refused where all cameras stand in one place, or look at
+    one thing only if they were written in another way than COLMAP's.
 
     Args:
         found: None: nothing was found.
         frames: which were to be registered.
         database: of features and matches, from which advice comes; None: the poses were known.
+        force: take known poses as they are.
 
     Raises:
         TooFewRegistered, ValueError: with what was found, and advice.
@@ -550,6 +562,16 @@ def refuse_poses(found: Reconstruction | None, frames: Frames, database: Path | 
             raise ValueError(
                 f"{text}; if it is a fisheye, film without it or undistort first; else {_WALK}"
             ) from error
+    poses = [camera.camera_to_world for camera in found.cameras.values()]
+    if database is None and not force and not _has_points_ahead(found):
+        if ways := other_readings(poses, _READINGS):
+            raise ValueError(
+                "colmap: expected world-to-camera poses with OpenCV's axes, but got cameras that look at one "
+                f"thing only if {', or if '.join(ways)}; write them anew, or force=true if they are right"
+            )
+        if float(np.abs(found.centers - found.centers[0]).max()) <= _SAME_PLACE * np.abs(found.centers).max():
+            got = "all in one place, which tells nothing of depth; compare the poses"
+            raise ValueError(f"colmap: expected cameras that move, but got {got}, or force=true if it is so")
     if not len(found.seen):  # of known poses alone; the reader derives what points would tell
         return
     extent = np.linalg.norm(found.centers - np.median(found.centers, axis=0), axis=1).max()
@@ -564,6 +586,15 @@ def refuse_poses(found: Reconstruction | None, frames: Frames, database: Path | 
             f"poses: expected a reprojection error of at most {MAX_ERROR} pixels, but got {found.error:.1f}; "
             "give masks= of what moves"
         )
+
+
+def _has_points_ahead(found: Reconstruction) -> bool:
+    """Tell whether most points lie before the cameras that see them."""
+    if not len(found.seen):
+        return False
+    axes = np.stack([np.asarray(camera.camera_to_world)[:3, 2] for camera in found.cameras.values()])
+    rows, points = found.seen.T
+    return bool((((found.points[points] - found.centers[rows]) * axes[rows]).sum(1) > 0).mean() > 0.5)
 
 
 def evidence_of(database: Path) -> Evidence:

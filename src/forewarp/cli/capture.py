@@ -17,7 +17,8 @@ What one types most:
   matching=exhaustive           match every pair of pictures, where the camera comes back to where it was
   lens=SIMPLE_RADIAL            a simpler camera, where few pictures or points tell of the lens
   threads=N seed=N              processors; random choices
-  force=true                    go on where the camera is said to stand or only to turn
+  force=true                    go on where the camera is said to stand or only to turn, or known
+                                poses to be wrong
   overwrite=true                replace an earlier capture in out
 
 After Ctrl-C the same command goes on.
