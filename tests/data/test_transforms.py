@@ -19,6 +19,7 @@ from forewarp.data.transforms import (
     check_times,
     left_aside,
     times_of,
+    with_intrinsics,
 )
 from tests.support.written_scenes import around, dnerf_shots, edit, write_dnerf
 
@@ -43,6 +44,33 @@ def camera(stored=(80, 60), common=None, **own):
 def test_one_reading_of_intrinsics(keys, fx, fy, cx):
     made = camera(**keys)
     assert (made.fx, made.fy, made.cx) == pytest.approx((fx, fy, cx))
+
+
+MATRIX = [[80.0, 0, 40], [0, 81, 20], [0, 0, 1]]
+FOUR = [[80.0, 0, 40, 0], [0, 81, 20, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
+
+
+@pytest.mark.parametrize(
+    ("own", "common", "focal", "told"),
+    [
+        ({"cam_K": MATRIX}, {"camera_angle_x": WIDE}, 80, ""),
+        ({"K": FOUR}, {"fl_x": 90.0, "cx": 7.0}, 80, ""),
+        ({"camera_matrix": [80, 0, 40, 0, 81, 20, 0, 0, 1]}, {}, 80, ""),
+        ({}, {"intrinsics": MATRIX}, 80, ""),
+        ({"fl_x": 80.0, "K": MATRIX}, {}, 80, ""),
+        ({"fl_x": 90.0, "K": MATRIX}, {}, 90, "K is left aside, as fl_x says another thing"),
+        ({"calib": MATRIX, "turn": np.eye(3).tolist()}, {"fl_x": 90.0}, 90, "calib is not read, which seems"),
+        ({"intrinsics": {"f": 80}}, {"fl_x": 90.0}, 90, "intrinsics is not read, which seems to be"),
+        ({"K": "none"}, {"fl_x": 90.0, "applied_transform": np.eye(4)[:3].tolist()}, 90, ""),
+    ],
+)
+def test_a_matrix_of_intrinsics_is_read_or_told(own, common, focal, told):
+    (entry,), lines = with_intrinsics([Entry("t.json", own, common=common)], "t.json")
+    read = camera_of(entry, (80, 40), 1, "a.png", pose=torch.eye(4))
+    assert read.fx == focal
+    assert (read.cx, read.cy) == (40, 20)
+    assert told in " ".join(lines)
+    assert bool(lines) == bool(told)
 
 
 def test_an_angle_of_upright_images_is_of_the_width_or_as_told():

@@ -67,6 +67,7 @@ from forewarp.data.transforms import (
     times_of,
     unread_times,
     with_images,
+    with_intrinsics,
     with_suffix,
 )
 from forewarp.files import write_json
@@ -311,6 +312,7 @@ def _read_file(
     """Read a transforms file; without its images where it is of a test split that was never rendered."""
     content, records, turned = read_json(path), [], []
     entries = frames_of(path, content, content | {"ability": ability})
+    entries, unread = with_intrinsics(entries, str(path))
     images = [with_suffix(entry.path("file_path")) for entry in entries]
     if ability != "all" or path.stem == "transforms_train" or any(os.path.isfile(i) for i in images):
         there, assumed = with_images(list(zip(entries, images)), images, str(path))
@@ -339,7 +341,7 @@ def _read_file(
         by_angle = entry.get("camera_angle_x") is not None
         by_angle &= entry.get("fl_x") is None and entry.get("fl_y") is None
         records.append(_Record(time_in(entry), camera, image, has_alpha, mask, depth, ability, by_angle))
-    assumed += turned_by_exif(turned, path) + unread_times(entries, str(path))
+    assumed += unread + turned_by_exif(turned, path) + unread_times(entries, str(path))
     return records, assumed + left_aside(zip((entry for entry, _ in there), (r.camera for r in records)))
 
 

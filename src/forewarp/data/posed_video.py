@@ -59,6 +59,7 @@ from forewarp.data.transforms import (
     times_of,
     unread_times,
     with_images,
+    with_intrinsics,
     with_suffix,
 )
 from forewarp.files import write_json
@@ -259,7 +260,7 @@ def _read_entries(
 
     Cost: one read of each PNG, of a JPEG's beginning and end; masks that ignore are decoded.
     """
-    frames = frames_of(file, content, content)
+    frames, unread = with_intrinsics(frames_of(file, content, content), str(file))
     images = [_file(entry, "file_path", scale) for entry in frames]
     there, assumed = with_images(list(zip(frames, images)), images, str(file))
     absent = {_name_of(file.parent, f.own.get("file_path"), f.where("file_path")) for f in frames}
@@ -299,7 +300,7 @@ def _read_entries(
         if any(given) and not all(given):
             got = f"{sum(given)} of {len(given)} and none in frames[{given.index(False)}]"
             raise mismatch(f"{file}: frames: {key}", "one in all frames or in none", got)
-    assumed += turned_by_exif(turned, file) + unread_times(frames, str(file))
+    assumed += unread + turned_by_exif(turned, file) + unread_times(frames, str(file))
     names = [entry.name for entry in entries]
     if len(set(names)) < len(names):
         twice = next(name for i, name in enumerate(names) if name in names[:i])

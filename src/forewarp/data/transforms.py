@@ -1,9 +1,9 @@
 """Read what the frames of every ``transforms*.json`` have in common, whatever its layout.
 
 Intrinsics are ``fl_x fl_y cx cy w h k1 k2 k3 p1 p2 camera_model``, ``camera_angle_x`` or ``camera_angle_y``
-alone, at the top of the file or in a frame. A pose is camera-to-world with OpenGL's axes (x right, y up,
-looking along -z), unless the caller says otherwise. What a file leaves open is assumed here, in one way, and
-told in a line.
+alone, or a matrix such as ``cam_K``, at the top of the file or in a frame. A pose is camera-to-world with
+OpenGL's axes (x right, y up, looking along -z), unless the caller says otherwise. What a file leaves open is
+assumed here, in one way, and told in a line.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import math
 import os
 import re
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from reprlib import repr as short
 from typing import TypeVar
@@ -45,6 +46,15 @@ _NO_PINHOLE = re.compile(
     re.IGNORECASE,
 )
 _UNREAD_LENSES = ("distortion_params", "distortion", "dist_coeffs", "distortion_coefficients", "dist")
+_MATRICES = (  # of intrinsics, as programs call them
+    "cam_K",
+    "K",
+    "intrinsics",
+    "intrinsic",
+    "intrinsic_matrix",
+    "camera_intrinsics",
+    "camera_matrix",
+)
 _FOCAL = ("fl_x", "fl_y", "camera_angle_x")
 _SAME_FOCAL = 0.02  # share by which two focal lengths of one camera may differ
 _OUTSIDE = 0.9  # share of a side beyond which a principal point is another image's
@@ -156,6 +166,61 @@ def _focal(entry: Entry, width: int, height: int, longer: bool) -> float:
         got = f"{angle:.4g} ({math.degrees(angle):.1f} degrees)"
         raise mismatch(entry.where("camera_angle_x"), expected, got, "remove the one that is wrong")
     return focal
+
+
+def with_intrinsics(entries: Sequence[Entry], where: str) -> tuple[list[Entry], list[str]]:
+    """Write a matrix of intrinsics out as ``fl_x fl_y cx cy``, which win where both are at one place.
+
+    Args:
+        entries: the frames of a file.
+        where: the file.
+
+    Returns:
+        the frames, and lines that say which matrices are not read.
+    """
+    read, told = [], {}
+    for entry in entries:
+        parts = {}
+        for place in ("own", "common"):
+            keys = getattr(entry, place)
+            key = next((key for key in _MATRICES if _intrinsics(keys.get(key)) is not None), None)
+            if key is not None:
+                values = dict(zip(("fl_x", "fl_y", "cx", "cy"), _intrinsics(keys[key])))
+                off = [k for k, v in values.items() if abs(_as_number(keys.get(k), v) / v - 1) > _SAME_FOCAL]
+                if off and not told:
+                    told[key] = f"{where}: {key} is left aside, as {off[0]} says another thing; remove one"
+                parts[place] = {**({} if off else values), **keys}
+        read.append(replace(entry, **parts) if parts else entry)
+    for key, value in {**entries[0].common, **entries[0].own}.items():
+        is_read = key in _MATRICES and _intrinsics(value) is not None
+        is_other = key in _MATRICES and key not in told and isinstance(value, (list, dict)) and not is_read
+        if is_other or (key not in _MATRICES and _intrinsics(value) is not None):
+            told[key] = (
+                f"{where}: {key} is not read, which seems to be intrinsics; write it as fl_x fl_y cx cy"
+            )
+    return read, list(told.values())
+
+
+def _as_number(value: object, default: float) -> float:
+    return value if isinstance(value, (int, float)) and abs(value) < _MOST_TIME else default
+
+
+def _intrinsics(value: object) -> list[float] | None:
+    """Return fx, fy, cx and cy of a matrix without skew, 3 x 3, 3 x 4 or 4 x 4, or nine numbers in a row;
+    None where a value is none, such as a pose.
+    """
+    if not isinstance(value, list):
+        return None
+    try:
+        matrix = np.array(value, dtype=np.float64)
+    except (TypeError, ValueError, OverflowError):
+        return None
+    matrix = matrix.reshape(3, 3) if matrix.shape in ((9,), (1, 9)) else matrix
+    if matrix.shape not in ((3, 3), (3, 4), (4, 4)) or matrix[:3, 3:].any():
+        return None
+    (fx, skew, cx), (zero, fy, cy), last = matrix[:3, :3].tolist()
+    is_one = last == [0, 0, 1] and zero == 0 and abs(skew) <= 1e-6 * abs(fx)
+    return [fx, fy, cx, cy] if is_one and min(fx, fy, cx, cy) > 0 and np.isfinite(matrix).all() else None
 
 
 def left_aside(cameras: Iterable[tuple[Entry, Camera]]) -> list[str]:
