@@ -22,7 +22,7 @@ from forewarp.export.html import _PLAYER, page, poster
 from forewarp.export.tracks import Source
 from forewarp.glb import meshopt
 from forewarp.metrics.image import psnr
-from forewarp.scene.camera import Lens
+from forewarp.scene.camera import Lens, orbit
 from forewarp.scene.frame import spread
 from forewarp.scene.view import Moment, View
 from tests.export.conftest import TIMES, exporter
@@ -369,7 +369,7 @@ def test_compressed_views_are_decoded_as_python_encodes_them(opened):
 @pytest.mark.slow
 def test_lenses_bend_what_it_draws(browser, particles, tmp_path):
     lens = Lens((0.5, -0.2, 0.1), (0.05, -0.06))
-    cameras = [replace(camera, lens=lens) for camera in particles.cameras]
+    cameras = [replace(camera, lens=lens, skew=2.0) for camera in particles.cameras]
     export(replace(particles, cameras=cameras), tmp_path / "html")
     tab = Tab(browser, None, width=320, height=320)
     tab.page.goto((tmp_path / "html" / "scene.html").as_uri())
@@ -377,6 +377,7 @@ def test_lenses_bend_what_it_draws(browser, particles, tmp_path):
     got = drawn(tab, particles, width=120, height=120, time=0.3, camera=0)
     assert psnr(got, rendered(particles, camera, 0.3)) > 50
     assert psnr(got, rendered(particles, replace(camera, lens=None), 0.3)) < 38
+    assert psnr(got, rendered(particles, replace(camera, skew=0.0), 0.3)) < 38
     assert tab.errors == []
     tab.page.close()
 
@@ -494,3 +495,39 @@ def test_a_broken_scene_is_told_and_the_picture_stays(browser, particles, tmp_pa
         tab.page.get_by_text(says).wait_for()
         assert tab.page.locator("#poster").is_visible()
         tab.page.close()
+
+
+@pytest.mark.browser
+@pytest.mark.slow
+def test_the_view_rides_along_with_one_camera_until_somebody_turns_it(browser, particles, tmp_path):
+    first, times = particles.cameras[0], torch.linspace(0, 1, 20, dtype=torch.float64)
+    path = orbit(first, torch.zeros(3, dtype=torch.float64), torch.tensor([0.0, 0, 1]).double(), 0.2 * times)
+    times = times.tolist()
+    source = replace(particles, cameras=path, image_times=times)
+    export(source, tmp_path / "html")
+    tab = Tab(browser, None, width=320, height=320)
+    file = (tmp_path / "html" / "scene.html").as_uri()
+    for time in (0.0, times[10], 1.0):
+        tab.page.goto("about:blank")
+        tab.page.goto(f"{file}?t={time}&controls=0")
+        tab.page.evaluate(SETTLED)
+        camera = path[times.index(time)]
+        assert state(tab, "riding") == [True]
+        np.testing.assert_allclose(state(tab, "eye")[0], camera.center, atol=0.02)
+        np.testing.assert_allclose(state(tab, "ahead")[0], camera.camera_to_world[:3, 2], atol=0.02)
+        np.testing.assert_allclose(state(tab, "down")[0], camera.camera_to_world[:3, 1], atol=0.02)
+    tab.page.keyboard.press("ArrowLeft")
+    eye = state(tab, "eye")[0]
+    tab.page.keyboard.press(",")
+    assert state(tab, "riding", "eye") == [False, eye]
+    tab.page.keyboard.press("r")
+    assert state(tab, "riding", "eye") != [True, eye]
+    tab.page.goto(f"{file}?t=0.5&camera=3")
+    assert state(tab, "riding") == [False]
+    assert tab.errors == []
+    tab.page.close()
+    export(replace(source, image_times=[(7 * i % 20) / 19 for i in range(20)]), tmp_path / "html")
+    tab = Tab(browser, None)
+    tab.page.goto(file)
+    assert state(tab, "riding", "path") == [False, None]  # of many cameras, or one that jumps
+    tab.page.close()

@@ -69,8 +69,15 @@ def packed_scene(
     rows = rows_in_file(gaussians, shown, moving_in_images(source))
     if not len(rows.order):
         raise ValueError("run: expected particles that can be seen, but got none; train it longer")
-    views = [cameras[0], *(cameras[i] for i in spread(len(cameras), _CAMERAS))]
-    setting = Setting(views, source.rotation_to("y"), focus_point(cameras), float(seconds), source.background)
+    numbers = [0, *spread(len(cameras), _CAMERAS)]
+    setting = Setting(
+        [cameras[number] for number in numbers],
+        source.rotation_to("y"),
+        focus_point(cameras),
+        float(seconds),
+        source.background,
+        [source.image_times[number] for number in numbers] if source.image_times else [],
+    )
     left_out = len(gaussians.means) - len(rows.order)
     facts = {"particles": len(rows.order), "moving": rows.in_motion, "left out": left_out}
     facts |= {"quality": quality, "seconds": seconds, "colors": "sRGB, as in the images"}

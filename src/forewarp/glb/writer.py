@@ -37,7 +37,8 @@ _TIMES = 64  # at which opacity over time is looked at
 class Setting:
     """What a page needs besides the Gaussians: ``cameras`` that have seen them, the first one to begin at;
     the ``rotation`` (3, 3) that makes y point upwards; the ``focus`` (3,) to turn about, world units; how
-    many ``seconds`` time lasts from 0 to 1; and the ``background`` (3,), sRGB.
+    many ``seconds`` time lasts from 0 to 1; the ``background`` (3,), sRGB; and ``times``, when each camera
+    took its image, where that is known.
     """
 
     cameras: Sequence[Camera]
@@ -45,6 +46,7 @@ class Setting:
     focus: Tensor
     seconds: float
     background: tuple[float, float, float]
+    times: Sequence[float] = ()
 
 
 def write(gaussians: MovingGaussians, setting: Setting, quality: str, rows: Rows) -> bytes:
@@ -69,6 +71,8 @@ def write(gaussians: MovingGaussians, setting: Setting, quality: str, rows: Rows
     splats |= {"sortingMethod": "cameraDistance", "extensions": {MOTION: motion}}
     primitive = {"mode": 0, "attributes": attributes, "extensions": {SPLATS: splats}}
     cameras = [_camera(camera) for camera in setting.cameras]
+    for camera, time in zip(cameras, setting.times):
+        camera["extras"]["time"] = time
     nodes = [
         {"name": "scene", "rotation": _quaternion(setting.rotation), "mesh": 0}
         | {"children": list(range(1, len(cameras) + 1))}

@@ -12,7 +12,7 @@ uniform highp sampler2D nodes;
 uniform mat3 rotation; // world to camera
 uniform vec3 eye;
 uniform vec2 focal, middle, size;
-uniform float near, margin, blur;
+uniform float near, margin, blur, skew;
 uniform vec3 radial; // of the lens
 uniform vec2 tangential;
 uniform float reach; // squared distance from the axis from which on the lens shows nothing
@@ -69,7 +69,7 @@ void main() {
   float xy = slope * px * py + 2.0 * (tangential.x * px + tangential.y * py);
   float xx = bent + slope * px * px + 2.0 * tangential.x * py + 6.0 * tangential.y * px;
   float yy = bent + slope * py * py + 2.0 * tangential.y * px + 6.0 * tangential.x * py;
-  vec2 pixel = focal * lensed + middle;
+  vec2 pixel = focal * lensed + vec2(skew * lensed.y, 0) + middle;
   if (any(lessThan(pixel, vec2(-margin))) || any(greaterThan(pixel, size + margin))) return;
 
   float opacity = place.w;
@@ -89,8 +89,9 @@ void main() {
   vec3 s = of(2).xyz, far = s * (transpose(root) * vec3(0, 0, 1));
   vec3 across = s * (transpose(root) * vec3(1, 0, 0)) - px * far;
   vec3 downward = s * (transpose(root) * vec3(0, 1, 0)) - py * far;
-  vec3 u = focal.x / local.z * (xx * across + xy * downward);
-  vec3 v = focal.y / local.z * (xy * across + yy * downward);
+  vec3 v = (xy * across + yy * downward) / local.z;
+  vec3 u = focal.x / local.z * (xx * across + xy * downward) + skew * v;
+  v *= focal.y;
   float a = dot(u, u) + blur, b = dot(u, v), c = dot(v, v) + blur;
   vec3 normal = cross(u, v); // of a needle, a c - b b would lose all digits
   float determinant = dot(normal, normal) + (a + c - blur) * blur;
@@ -227,6 +228,7 @@ function fitted(lens, width, height) {
       lens.cy * scale + (height - lens.height * scale) / 2,
     ],
     size: [width, height],
+    skew: (lens.skew ?? 0) * scale,
     bend: lens.lens ?? [0, 0, 0, 0, 0],
   };
 }
@@ -447,6 +449,7 @@ class Renderer {
     this.setCamera(project, view);
     gl.uniform1f(project.place("margin"), scene.margin * Math.max(width, height));
     gl.uniform1f(project.place("blur"), scene.blur);
+    gl.uniform1f(project.place("skew"), view.skew);
     gl.uniform3fv(project.place("radial"), view.bend.slice(0, 3));
     gl.uniform2fv(project.place("tangential"), view.bend.slice(3));
     gl.uniform1f(project.place("reach"), reachOf(view));

@@ -153,7 +153,7 @@ function camerasOf(gltf, matrices, turn) {
     const f = height / (2 * Math.tan(yfov / 2)), width = aspectRatio * height;
     const lens = { width, height, fx: f, fy: f, cx: width / 2, cy: height / 2, ...camera.extras };
     return [{
-      name: node.name, lens, eye: turned(m[12] - turn[12], m[13] - turn[13], m[14] - turn[14]),
+      lens, time: lens.time, eye: turned(m[12] - turn[12], m[13] - turn[13], m[14] - turn[14]),
       right: turned(m[0], m[1], m[2]), down: turned(-m[4], -m[5], -m[6]), ahead: turned(-m[8], -m[9], -m[10]),
     }];
   });

@@ -4,6 +4,7 @@ const REST = 180; // milliseconds without a change after which a picture is draw
 const SCALES = [1, 0.75, 0.55, 0.4, 0.3]; // of the canvas's pixels, while something moves
 const SLOW = 45, QUICK = 24; // milliseconds between frames from which on pictures become smaller, or larger
 const QUIET = 2800; // milliseconds after which the controls fade while the scene plays
+const STEADY = Math.cos(0.5), STEP = 0.5; // between cameras of a path: least cosine, most of the distance
 const BEHIND = { dark: [0.055, 0.059, 0.071], light: [1, 1, 1] };
 
 const byId = (id) => document.getElementById(id);
@@ -77,6 +78,27 @@ class Sorting {
   }
 }
 
+// Return the cameras of the file by their times if one camera went smoothly from each to the next; else null.
+function pathOf({ cameras, focus }) {
+  const path = cameras.filter(({ time }) => time !== undefined).sort((a, b) => a.time - b.time);
+  const near = (a, b) => {
+    const away = Math.hypot(...add(focus, a.eye, -1)), step = Math.hypot(...add(b.eye, a.eye, -1));
+    return dot(a.ahead, b.ahead) > STEADY && step < STEP * away;
+  };
+  const smooth = path.length > 2 && path.every((camera, i) => i === 0 || near(path[i - 1], camera));
+  return smooth ? path : null;
+}
+
+// Return where the camera of a path is at a time, between the two that are nearest in time.
+function poseOn(path, time) {
+  const next = path.findIndex((camera) => camera.time > time);
+  const [before, after] = [path[next < 0 ? path.length - 1 : Math.max(next - 1, 0)], path[next < 0 ? path.length - 1 : next]];
+  const share = after.time > before.time ? clamp((time - before.time) / (after.time - before.time), 0, 1) : 0;
+  const mixed = (name) => add(before[name].map((value) => (1 - share) * value), after[name], share);
+  const ahead = unit(mixed("ahead")), right = unit(cross(mixed("down"), ahead));
+  return { eye: mixed("eye"), ahead, right, down: cross(ahead, right) };
+}
+
 class Player {
   constructor(scene) {
     this.scene = scene;
@@ -98,15 +120,34 @@ class Player {
       this.stale = true;
       this.wake();
     });
+    this.path = pathOf(scene);
+    this.home();
+  }
+
+  // Look through the first camera, or along with the one that moved through the scene.
+  home() {
     this.look(0);
+    this.ride(this.path !== null);
+  }
+
+  // Go along with the camera that took the images, until somebody turns or shifts the view.
+  ride(on) {
+    this.riding = on && this.path !== null;
+    byId("ride").setAttribute("aria-pressed", this.riding);
+    if (this.riding) this.stand(poseOn(this.path, this.time));
   }
 
   // Look through a camera of the file.
   look(number) {
-    const { cameras, focus, near } = this.scene;
+    this.ride(false);
     this.camera = number;
-    const { lens, eye, right, down, ahead } = cameras[number];
-    this.lens = lens;
+    this.lens = this.scene.cameras[number].lens;
+    this.stand(this.scene.cameras[number]);
+  }
+
+  // Stand where a camera stands.
+  stand({ eye, right, down, ahead }) {
+    const { focus, near } = this.scene;
     Object.assign(this, { eye: [...eye], right: unit(right), down: unit(down), ahead: unit(ahead) });
     const along = dot(add(focus, eye, -1), this.ahead);
     this.away = along > 2 * near ? along : Math.max(Math.hypot(...add(focus, eye, -1)), 2 * near);
@@ -121,6 +162,7 @@ class Player {
 
   setTime(time) {
     this.time = clamp(time, 0, 1);
+    if (this.riding) this.stand(poseOn(this.path, this.time));
     this.untimed = this.stale = this.unsorted = true;
     this.changed = performance.now();
     this.wake();
@@ -128,6 +170,7 @@ class Player {
 
   // Turn about the point that the camera looks at, by angles to the left and upwards.
   turn(left, upward) {
+    this.ride(false);
     const { right, scene: { up } } = this, target = add(this.eye, this.ahead, this.away);
     const height = Math.asin(clamp(dot(this.ahead, up), -1, 1));
     const lift = clamp(height + upward, -1.5, 1.5) - height;
@@ -140,6 +183,7 @@ class Player {
 
   // Shift what is seen by CSS pixels.
   shift(dx, dy) {
+    this.ride(false);
     const { focal } = fitted(this.lens, this.canvas.clientWidth, this.canvas.clientHeight);
     this.eye = add(this.eye, this.right, (-dx * this.away) / focal[0]);
     this.eye = add(this.eye, this.down, (-dy * this.away) / focal[1]);
@@ -148,6 +192,7 @@ class Player {
 
   // Go nearer by a factor below 1, or farther.
   approach(factor) {
+    this.ride(false);
     const target = add(this.eye, this.ahead, this.away);
     this.away = Math.max(this.away * factor, 2 * this.scene.near);
     this.eye = add(target, this.ahead, -this.away);
@@ -311,7 +356,7 @@ class Player {
 function connect(player) {
   const { canvas } = player, panel = byId("panel"), keys = byId("keys");
   const click = (id, action) => byId(id).addEventListener("click", action);
-  const home = () => player.look(0), next = () => player.look((player.camera + 1) % player.scene.cameras.length);
+  const home = () => player.home(), next = () => player.look((player.camera + 1) % player.scene.cameras.length);
   const toggleHelp = () => {
     const { count, inMotion } = player.scene, { bits } = player.renderer;
     const sorted = player.sorting.milliseconds.toFixed(1);
@@ -329,6 +374,7 @@ function connect(player) {
     else document.documentElement.requestFullscreen?.();
   };
   byId("whole").hidden = !document.fullscreenEnabled;
+  byId("ride").hidden = !player.path;
   byId("camera").hidden = player.scene.cameras.length < 2;
   byId("layers").hidden = !player.scene.inMotion || player.scene.inMotion === player.scene.count;
   for (const name of ["play", "time", "clock", "trails"]) byId(name).disabled = !player.scene.moving;
@@ -338,6 +384,7 @@ function connect(player) {
   click("more", () => togglePanel());
   click("trails", () => player.setTrails(!player.trails));
   click("camera", next);
+  click("ride", () => player.ride(!player.riding));
   click("help", toggleHelp);
   byId("time").addEventListener("input", ({ target }) => {
     player.play(false);
@@ -352,7 +399,7 @@ function connect(player) {
   const actions = {
     " ": () => player.play(!player.playing), h: home, c: next, f: toggleWhole, v: () => togglePanel(), "?": toggleHelp,
     l: () => player.choose("loop"), b: () => player.choose("behind"), t: () => player.setTrails(!player.trails),
-    m: () => byId("layers").hidden || player.choose("layer"), "+": () => player.approach(0.9), "=": () => player.approach(0.9),
+    r: () => player.ride(!player.riding), m: () => byId("layers").hidden || player.choose("layer"), "+": () => player.approach(0.9), "=": () => player.approach(0.9),
     "-": () => player.approach(1 / 0.9), ",": () => step(-1), ".": () => step(1),
     "[": () => speedUp(-1), "]": () => speedUp(1), escape: () => togglePanel(false),
   };
