@@ -288,7 +288,6 @@ class Player {
     this.renderer.drawTarget(view, this.layer);
     this.renderer.drawCanvas(view, this.background(), trail);
     if (scale !== 1) this.stale = true; // once more, sharply, when nothing moves any more
-    this.sharp = scale === 1;
   }
 
   showTime() {
