@@ -13,7 +13,7 @@ import torch
 import forewarp
 from forewarp.fields.curves import Curve
 from forewarp.fields.moving import MovingGaussians, NodeMotion
-from forewarp.glb.reader import read
+from forewarp.glb.reader import Container, read
 from forewarp.glb.writer import COMPACT, LOSSLESS, MOTION, SPLATS, Setting, morton, rows_in_file, write
 from forewarp.scene.camera import Lens
 from forewarp.scene.cloud import Ellipsoids
@@ -268,6 +268,10 @@ WRONG = {
     "more in motion": (in_motion("inMotion", 10**5), "inMotion: expected a whole number from 0 to"),
     "more that move": (in_motion("moving", 10**5), "moving: expected a whole number from 0 to"),
     "an unknown curve": (in_motion("curve", "kind", "bezier"), "kind: expected spline or cosines"),
+    "cosines with offsets": (
+        lambda d: motion_of(d)["curve"].update(kind="cosines", padding=0.2),
+        "curve.kind: expected spline, as there are timeOffsets, but got 'cosines'",
+    ),
     "a curve of other length": (in_motion("curve", "count", 9), "translations: expected"),
     "far too many links": (in_motion("links", [1] * 17), "links: expected a list of at most 16, but got"),
     "far too many cosines": (in_motion("colorOverTime", [8] * 65), "expected a list of at most 64"),
@@ -276,7 +280,7 @@ WRONG = {
     "no weights": (in_motion("weights", []), "weights: expected accessors, but got none"),
     "offsets of other length": (
         lambda d: in_motion("timeOffsets", "offsets", motion_of(d)["opacityLogits"])(d),
-        "expected ascending times with offsets",
+        "expected ascending times in [0, 1] with offsets",
     ),
     "a list for an object": (setter(["meshes", 0], []), r"meshes[0]: expected an object, but got []"),
     "no lens": (setter(["cameras", 0, "extras", "lens"], [1]), "lens: expected 5 numbers, but got [1]"),
@@ -368,6 +372,7 @@ def test_numbers_that_are_none_are_refused(every, kept, key, value):
         (f"{SPLATS}:OPACITY", "<f4", 1.5, "OPACITY: expected numbers in its range"),
         (f"{SPLATS}:SCALE", "<f4", -1.0, "SCALE: expected numbers in its range"),
         ("times", "<f4", 2.0, "expected ascending times"),
+        ("times", "<f4", -0.5, r"expected ascending times in [0, 1]"),
         ("offsets", "<f4", 0.5, "offsets of at most 0.2"),
     ],
 )
@@ -382,6 +387,40 @@ def test_numbers_out_of_range_are_refused(every, kept, key, dtype, value, says):
     with pytest.raises(ValueError) as caught:  # noqa: PT011
         read(kept(packed(description, wrong)))
     assert says in str(caught.value)
+
+
+def test_accessors_of_one_view_take_no_more_memory_than_views_may(every, monkeypatch):
+    description, binary = unpacked(written(every))
+    rows = 5 * 10**5
+    count = len(binary)
+    binary += bytes(3 * rows)
+    description["buffers"][0]["byteLength"] = len(binary)
+    view = {"buffer": 0, "byteOffset": count, "byteLength": 3 * rows}
+    one = {"bufferView": len(description["bufferViews"]), "componentType": 5121, "count": rows}
+    description["bufferViews"].append(view)
+    description["accessors"].append(one | {"type": "VEC3", "normalized": True})
+    monkeypatch.setattr("forewarp.glb.reader.MOST_ARRAYS", 24 * rows - 1)
+    container = Container(packed(description, binary))
+    number = len(description["accessors"]) - 1
+    container.array(number, "VEC3", place="here")
+    with pytest.raises(ValueError, match=r"^here: expected at most \d+ bytes in all, but got more"):
+        container.array(number, "VEC3", place="here")
+
+
+def test_whole_numbers_of_nodes_are_lengths(every, kept):
+    description, binary = unpacked(written(every))
+    number = motion_of(description)["nodes"]["translations"]
+    accessor = description["accessors"][number]
+    count = len(binary)
+    steps = np.random.default_rng(0).integers(-2, 3, (accessor["count"], 3))
+    files = []
+    for dtype, component in (("<i2", 5122), ("<f4", 5126)):
+        content = np.ascontiguousarray(steps, dtype).tobytes()
+        view = {"buffer": 0, "byteOffset": count, "byteLength": len(content)}
+        description["bufferViews"][accessor["bufferView"]] = view
+        accessor["componentType"] = component
+        files.append(read(kept(packed(description, binary + content))).gaussians.ellipsoids(0.7).centers)
+    torch.testing.assert_close(*files)
 
 
 def test_what_is_not_known_beside_it_is_passed_over(every, kept):

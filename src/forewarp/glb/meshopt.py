@@ -6,6 +6,8 @@ with 0, 2, 4 or 8 bits each: see the extension's text, "Mode 0: attributes" and 
 
 from __future__ import annotations
 
+from array import array
+
 import numpy as np
 
 _HEADER, _TAIL = 0xA0, 32  # first byte; bytes of the tail, at least
@@ -109,7 +111,7 @@ def decode(data: bytes, count: int, stride: int) -> np.ndarray:
         raise ValueError(f"expected a stride of 4, 8, ... 256, but got {stride}")
     if len(data) < least_bytes(count, stride) or data[0] != _HEADER:
         raise ValueError(f"expected {count} elements by attribute codec 0, but got other bytes")
-    size, begin, places, modes = _block_elements(stride), 1, [], []
+    size, begin, places, modes = _block_elements(stride), 1, array("q"), bytearray()
     end = len(data) - max(_TAIL, stride)
     two, four = _ESCAPES[2], _ESCAPES[4]
     for first in range(0, count, size):
@@ -132,7 +134,9 @@ def decode(data: bytes, count: int, stride: int) -> np.ndarray:
             raise ValueError("expected compressed data to go on, but they ended")
     if begin != end:
         raise ValueError(f"expected {count} elements by attribute codec 0, but got more")
-    values = _groups(np.frombuffer(data, np.uint8), np.array(places, np.int64), np.array(modes, np.uint8))
+    values = _groups(
+        np.frombuffer(data, np.uint8), np.frombuffer(places, np.int64), np.frombuffer(modes, np.uint8)
+    )
     signed = (values >> 1) ^ -(values & 1)  # wraps around, as bytes do
     elements, first = np.empty((count, stride), np.uint8), 0
     for start in range(0, count, size):

@@ -165,6 +165,7 @@ class Container:
         end = offset + (rows - 1) * stride + width * dtype.itemsize
         if stride < width * dtype.itemsize or end > len(elements):
             raise ValueError(f"{accessor.place}: expected {end} bytes, but got {len(elements)}")
+        self._take(rows * width * np.dtype(np.float32).itemsize, place)  # many accessors may read one view
         strides = (stride, dtype.itemsize)
         values = np.ndarray((rows, width), dtype, elements.data, offset, strides).copy()
         if accessor.flag("normalized", False):
@@ -186,6 +187,12 @@ class Container:
                 self._decoded[number] = self._uncompressed(extensions.part(COMPRESSION))
         return self._decoded[number], stride
 
+    def _take(self, size: int, place: str) -> None:
+        """Count the bytes of an array before there is one."""
+        self._room -= size
+        if self._room < 0:
+            raise ValueError(f"{place}: expected at most {MOST_ARRAYS} bytes in all, but got more")
+
     def _bytes(self, part: Fields) -> memoryview:
         part.whole("buffer", 0, 0)
         begin, length = part.whole("byteOffset", 0, 2**31, 0), part.whole("byteLength", 1, 2**31)
@@ -202,9 +209,7 @@ class Container:
         )
         if mode != "ATTRIBUTES" or name not in _ONE_FILTER or _ONE_FILTER[name] not in (None, stride):
             raise ValueError(f"{part.place}: expected attributes, but got {mode} by {name} of {stride} bytes")
-        self._room -= count * stride
-        if self._room < 0:
-            raise ValueError(f"{part.place}: expected at most {MOST_ARRAYS} bytes in all, but got more")
+        self._take(count * stride, part.place)
         try:
             elements = meshopt.decode(data, count, stride)
         except ValueError as error:
@@ -342,7 +347,12 @@ def _motion(container: Container, motion: Fields, canonical_time: float, count: 
     if not moving:
         return None
     nodes, about = motion.part("nodes"), motion.part("curve")
-    positions = container.array(nodes.content.get("positions"), "VEC3", place=f"{nodes.place}.positions")
+
+    def array(key: str, rows: int | None = None) -> torch.Tensor:
+        values = container.array(nodes.content.get(key), "VEC3", rows, place=f"{nodes.place}.{key}")
+        return torch.from_numpy(values.astype(np.float32, copy=False))
+
+    positions = array("positions")
     kind, frames = about.text("kind"), about.whole("frames", 2, 10**9)
     natural = kind == "spline" and about.flag("natural", False)
     if kind not in KINDS:
@@ -352,9 +362,7 @@ def _motion(container: Container, motion: Fields, canonical_time: float, count: 
     if kind == "cosines":
         about.fixed("padding", PADDING)
     curves = [
-        torch.from_numpy(
-            container.array(nodes.content[key], "VEC3", len(positions) * number, place=f"{nodes.place}.{key}")
-        ).reshape(-1, number, 3)
+        array(key, len(positions) * number).reshape(-1, number, 3)
         if key in nodes or key == "translations"
         else None
         for key in ("translations", "rotations")
@@ -363,9 +371,10 @@ def _motion(container: Container, motion: Fields, canonical_time: float, count: 
     padded = torch.zeros(2, count, links.shape[1])
     padded[0, :moving], padded[1, :moving] = links, weights
     curve = Curve.exactly(kind, number, frames, canonical_time, straight=natural)
-    return NodeMotion(
-        torch.from_numpy(positions), *curves, curve, padded[0].int(), padded[1], *_offsets(container, motion)
-    )
+    times, offsets = _offsets(container, motion)
+    if kind == "cosines" and times:
+        raise ValueError(f"{about.place}.kind: expected spline, as there are timeOffsets, but got 'cosines'")
+    return NodeMotion(positions, *curves, curve, padded[0].int(), padded[1], times, offsets)
 
 
 def _links(
@@ -397,10 +406,11 @@ def _offsets(container: Container, motion: Fields) -> tuple[list[float], list[fl
         container.array(part.content.get(key), "SCALAR", place=f"{part.place}.{key}")[:, 0].astype(float)
         for key in ("times", "offsets")
     )
-    good = len(times) == len(offsets) and bool((np.diff(times) > 0).all())
+    good = len(times) == len(offsets) and bool((np.diff(times) > 0).all()) and 0 <= times[0] <= times[-1] <= 1
     if not good or float(np.abs(offsets).max()) > FARTHEST + 1e-6:
         raise ValueError(
-            f"{part.place}: expected ascending times with offsets of at most {FARTHEST}, but got others"
+            f"{part.place}: expected ascending times in [0, 1] with offsets of at most {FARTHEST}, but got "
+            "others"
         )
     return times.tolist(), offsets.tolist()
 
