@@ -92,6 +92,20 @@ def cosines(count: int, time: float, canonical_time: float) -> list[float]:
     ]
 
 
+def around(times: Sequence[float], time: float) -> dict[int, float]:
+    """Return the rows of the one or two of ``times``, which rise, around a time, each with its weight.
+
+    >>> around([0.0, 0.5, 1.0], 0.625), around([0.0, 0.5, 1.0], 1.5)
+    ({1: 0.75, 2: 0.25}, {2: 1.0})
+    """
+    after = bisect_left(times, time)
+    if after in (0, len(times)):
+        return {min(after, len(times) - 1): 1.0}
+    low, high = times[after - 1 : after + 1]
+    share = (time - low) / (high - low)
+    return {row: part for row, part in ((after - 1, 1 - share), (after, share)) if part > 0}
+
+
 @dataclass(eq=False)
 class GaussiansSnapshot:
     """Gaussians at a moment.
@@ -186,11 +200,9 @@ class NodeMotion:
 
     def motion_time(self, time: float) -> float:
         """Return the time of the motion that an image of a given time shows."""
-        after = bisect_left(self.times, time)
-        if after in (0, len(self.times)):
-            return time + (self.offsets[min(after, len(self.times) - 1)] if self.times else 0.0)
-        (low, high), (first, last) = (part[after - 1 : after + 1] for part in (self.times, self.offsets))
-        return time + first + (last - first) * (time - low) / (high - low)
+        if not self.times:
+            return time
+        return time + sum(weight * self.offsets[row] for row, weight in around(self.times, time).items())
 
     def basis(self, time: float) -> Tensor:
         """Return the curve's basis (K,) at a given time."""

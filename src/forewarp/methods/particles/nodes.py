@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from bisect import bisect_left
 from collections.abc import Mapping, Sequence
 
 import torch
 from torch import Tensor, nn
 
 from forewarp.fields.curves import Curve
+from forewarp.fields.moving import around
 from forewarp.ops.nodes import carry_nodes, skin_weights, spread_nodes
 from forewarp.scene.cloud import far_apart, nearest
 
@@ -43,28 +43,15 @@ class TimeOffsets(nn.Module):
         self.learns = True
         self.values = nn.Parameter(torch.zeros(len(times), 1))
 
-    def weights(self, time: float) -> dict[int, float]:
-        """Return the rows of the one or two training times around a time, each with its weight.
-
-        >>> TimeOffsets([0.0, 0.5, 1.0], 1.5).weights(0.625)
-        {1: 0.75, 2: 0.25}
-        """
-        after = bisect_left(self.times, time)
-        if after in (0, len(self.times)):
-            return {min(after, len(self.times) - 1): 1.0}
-        low, high = self.times[after - 1 : after + 1]
-        share = (time - low) / (high - low)
-        return {row: part for row, part in ((after - 1, 1 - share), (after, share)) if part > 0}
-
     def __call__(self, time: float) -> float:
         """Return the time of the motion, up to ``most`` steps beyond [0, 1]."""
-        off = sum(weight * self.values.detach()[row].item() for row, weight in self.weights(time).items())
+        off = sum(w * self.values.detach()[row].item() for row, w in around(self.times, time).items())
         return time + self.step * min(max(off, -self.most), self.most)
 
     def gradients(self, time: float, by_motion_time: float) -> Tensor:
         """Return the gradients by ``values``, given the one by the time of the motion."""
         gradients = torch.zeros_like(self.values)
-        for row, weight in self.weights(time).items():
+        for row, weight in around(self.times, time).items():
             gradients[row] = weight * self.step * by_motion_time
         return gradients
 
