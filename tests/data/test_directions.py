@@ -1,5 +1,6 @@
 """Poses that were written in another way than they are read are recognised by what their cameras look at."""
 
+import numpy as np
 import pytest
 import torch
 
@@ -15,6 +16,43 @@ from forewarp.data.files import SceneError
 from tests.support.written_scenes import around
 
 CHANGES = {"inverse": inverted, "axes": opposite}
+
+
+# What docs/own-data.md gives for conversion.
+MIRROR, TO_OPENGL = (
+    np.diag([1.0, 1, -1, 1]),
+    np.array([[0, 0, -1, 0], [-1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1.0]]),
+)
+
+
+@pytest.mark.parametrize("kind", ["unity", "ros", "pytorch3d"])
+def test_axes_that_no_key_names_are_converted(kind):
+    """Written by what right, up and ahead are; converted as the documentation says, they are right."""
+    stored, converted = [], []
+    for pose in around():
+        right, down, ahead, center = pose[:3].double().numpy().T
+        if kind == "unity":  # y up, z into the distance: left-handed; all lengths along z are negated
+            flip = np.array([1, 1, -1])
+            columns = [flip * right, -flip * down, flip * ahead, flip * center]
+        else:
+            columns = [*{"ros": (ahead, -right, -down), "pytorch3d": (-right, -down, ahead)}[kind], center]
+        matrix = np.eye(4)
+        matrix[:3] = np.stack(columns, 1)
+        stored.append(torch.from_numpy(matrix @ FLIP))
+        mended = {
+            "unity": lambda m: MIRROR @ m @ MIRROR,
+            "ros": lambda m: m @ TO_OPENGL,
+            "pytorch3d": lambda m: m @ np.diag([-1.0, 1, -1, 1]),
+        }[kind](matrix)
+        converted.append(torch.from_numpy(mended @ FLIP))
+    torch.testing.assert_close(torch.stack(converted), torch.stack(around()).double())
+    said = (
+        "only if x is ahead, as of ROS and Isaac; convert them"
+        if kind == "ros"
+        else r"convert poses of Unity \(left-handed\)"
+    )
+    with pytest.raises(SceneError, match=said):
+        check_directions(stored, "t.json", inverse=False)
 
 
 def in_a_row():

@@ -172,7 +172,17 @@ def test_splits_that_disagree_or_overlap_are_named(tmp_path):
     for frame, pose in zip(test["frames"], around(5)):  # OpenCV's axes
         frame["transform_matrix"] = pose.tolist()
     (folder / "transforms_test.json").write_text(json.dumps(test))
-    with pytest.raises(SceneError, match="test images: .* look away from one point; write them as in"):
+    as_in = "{} images: .* look away from one point; write them as in transforms_{}.json"
+    with pytest.raises(SceneError, match=as_in.format("test", "train")):
+        dnerf.read_scene(tmp_path, "toy")
+    for frame, pose in zip(test["frames"], around(5)):
+        frame["transform_matrix"] = (pose @ torch.from_numpy(FLIP)).tolist()
+    train["frames"] = [
+        {**frame, "transform_matrix": pose.tolist()} for frame, pose in zip(train["frames"], around(7))
+    ]
+    for file, content in zip(files, (test, train)):
+        file.write_text(json.dumps(content))
+    with pytest.raises(SceneError, match=as_in.format("train", "test")):
         dnerf.read_scene(tmp_path, "toy")
 
 

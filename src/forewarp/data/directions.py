@@ -14,6 +14,9 @@ from forewarp.data.files import mismatch
 _Change = Callable[[torch.Tensor], torch.Tensor]  # of poses (N, 4, 4)
 _LEAST_CAMERAS = 4  # of which can be told whether they look at something in common
 _ALL = 0.9  # share of cameras before which a common point must lie
+_MET = 0.05  # miss of axes that meet where a program made all cameras look
+_RISE = 0.05  # sine of the angle by which cameras are above or below what they look at
+_CONVERT = "convert poses of Unity (left-handed) or PyTorch3D (docs/own-data.md)"
 _MEET, _MISS = 0.15, 0.5  # miss of the axes in shares of the distance: they meet in a point, they do not
 
 
@@ -30,20 +33,24 @@ def check_directions(
 
     Raises:
         SceneError: if all cameras look away from one point, as OpenCV's axes read as OpenGL's do, or have
-            nothing in common but their inverses have: naming the key that mends it.
+            nothing in common but their inverses have, or their x axes: naming the key that mends it.
     """
     if len(poses) < _LEAST_CAMERAS:
         return
     miss, ahead, _ = _meeting(torch.stack(list(poses)))
+    expected = "cameras that look at what they surround (OpenGL's axes: x right, y up, looking along -z)"
+    missed, before, _ = _meeting(x_ahead(torch.stack(list(poses))))
+    if (miss >= _MEET or ahead == 0) and missed < min(_MET, miss / 2) and before == 1:
+        got = "cameras that look at one point only if x is ahead, as of ROS and Isaac"
+        advice = advice or "convert them (docs/own-data.md), or set data.axes=opengl if they are right"
+        raise mismatch(where, expected, got, advice)
     if miss < _MEET and ahead == 0:
-        raise mismatch(
-            where,
-            "cameras that look at what they surround (OpenGL's axes: x right, y up, looking along -z)",
-            "cameras that all look away from one point",
-            advice
-            or "set data.axes=opencv (of PyTorch3D's, x left and y up, turn the poses about z first), "
-            "or data.axes=opengl if they do look outwards",
-        )
+        outwards = "data.axes=opengl if they do look outwards"
+        if _rise(opposite(torch.stack(list(poses)))) > _RISE:
+            mended = f"set data.axes=opencv, or {outwards}"
+        else:  # of a mirrored world, too, axes meet; then cameras seem to be below what they look at
+            mended = f"{_CONVERT}; else set data.axes=opencv, or {outwards}"
+        raise mismatch(where, expected, "cameras that all look away from one point", advice or mended)
     if miss < _MEET and ahead < _ALL:
         expected, got = "cameras that look at one thing", f"{1 - ahead:.0%} of them that look away from it"
         advice = advice or "write all in the same axes, or set data.axes=opengl if they are right"
@@ -104,6 +111,13 @@ def opposite(poses: torch.Tensor) -> torch.Tensor:
     return poses @ torch.from_numpy(FLIP)
 
 
+def x_ahead(poses: torch.Tensor) -> torch.Tensor:
+    """Take poses (N, 4, 4) that were read as OpenGL's for x ahead, y left and z up."""
+    changed = poses.clone()
+    changed[:, :3, :3] = poses[:, :3, [1, 2, 0]]
+    return changed
+
+
 def transposed(poses: torch.Tensor) -> torch.Tensor:
     """Invert the rotations of poses (N, 4, 4) alone."""
     changed = poses.clone()
@@ -133,6 +147,17 @@ def common_point(poses: Sequence[torch.Tensor]) -> torch.Tensor | None:
         return None
     miss, ahead, point = _meeting(torch.stack(list(poses)))
     return point if miss < _MEET and ahead >= _ALL else None
+
+
+def _rise(poses: torch.Tensor) -> float:
+    """Return the sine of the angle by which cameras (N, 4, 4) are above the point that they look at, up being
+    the mean of their images' upward axes; 0 where that is none.
+    """
+    up, (_, _, point) = -poses[:, :3, 1].mean(0), _meeting(poses)
+    if point is None or float(up.norm()) < _RISE:
+        return 0.0
+    away = poses[:, :3, 3] - point
+    return float((away @ (up / up.norm()) / away.norm(dim=-1).clamp(min=1e-12)).mean())
 
 
 def _meeting(poses: torch.Tensor) -> tuple[float, float, torch.Tensor | None]:

@@ -35,9 +35,8 @@ from forewarp.data.cameras import (
     opengl_rows,
     space_of,
 )
-from forewarp.data.directions import check_directions
+from forewarp.data.directions import check_directions, common_point
 from forewarp.data.files import (
-    MARKERS,
     frames_of,
     mismatch,
     nearly,
@@ -272,6 +271,7 @@ def _read_records(
         if not records["test"]:
             raise mismatch(folder, "images to test on, or at least 3 to train on", f"{len(ordered)} in all")
     trained = {record.image for record in records["train"]}
+    agree = [s for s in SPLITS if common_point([r.camera.camera_to_world for r in records[s]]) is not None]
     for split in SPLITS:
         images = Counter(record.image for record in records[split]).most_common(1)
         if images and images[0][1] > 1:
@@ -279,7 +279,10 @@ def _read_records(
                 f"{folder}: {split}", "each image once", f"{images[0][0].name} twice", "remove one"
             )
         poses = [record.camera.camera_to_world for record in records[split]]
-        advice = None if split == "train" else f"write them as in {MARKERS['dnerf']}"
+        advice, other = None, next((s for s in agree if s != split), None)
+        if other or split != "train":
+            wanted = f"as in transforms_{other}.json" if other else "all in OpenGL's axes (docs/own-data.md)"
+            advice = f"write them {wanted}, or set data.axes=opengl if they are right"
         if axes is None:
             check_directions(poses, f"{folder}: {split} images", inverse=inverse, advice=advice)
         if split != "train" and (both := sum(record.image in trained for record in records[split])):
