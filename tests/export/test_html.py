@@ -384,6 +384,25 @@ def test_lenses_bend_what_it_draws(browser, particles, tmp_path):
 
 @pytest.mark.browser
 @pytest.mark.slow
+def test_each_camera_leaves_out_what_is_too_near_to_it(browser, particles, tmp_path):
+    first, second, *others = particles.cameras
+    away = float(second.center.norm())  # half of the scene is nearer
+    cameras = [first, replace(second, near=10 * away, far=20 * away), *others]
+    export(replace(particles, cameras=cameras), tmp_path / "html")
+    tab = Tab(browser, None, width=320, height=320)
+    tab.page.goto((tmp_path / "html" / "scene.html").as_uri())
+    for number in (0, 2):
+        camera = cameras_of(replace(particles, cameras=cameras))[number].resized(120, 120)
+        got = drawn(tab, particles, width=120, height=120, time=0.3, camera=number)
+        assert psnr(got, rendered(particles, camera, 0.3)) > 50
+    whole = rendered(particles, second.resized(120, 120), 0.3)
+    assert psnr(got, whole) < 30
+    assert tab.errors == []
+    tab.page.close()
+
+
+@pytest.mark.browser
+@pytest.mark.slow
 def test_the_page_of_a_run_looks_as_the_run_renders_it(browser, ok, fitted, tmp_path):
     data = [f"data.root={fitted.parent}/scenes", "data=dnerf", "data.scene=vehicle", "budget.minutes=null"]
     words = ["budget.iterations=200", "model=particles", "preset=demo", "trainer=cpu", "evaluate=false"]

@@ -40,11 +40,6 @@ _COLLAPSED = 0.05  # of the longest axis: what a blend of maps has pressed flatt
 _ROUNDING = 1e-6  # of all time, by which a curve is continued farther than offsets ask for
 
 
-def nearest_shown(camera: Camera) -> float:
-    """Return the depth, world units, that a Gaussian's centre needs more of to be drawn."""
-    return max(_NEAR * camera.near, _LEAST_NEAR * camera.far)
-
-
 @lru_cache(maxsize=4096)
 def pinhole_of(camera: Camera, blur: float) -> Pinhole:
     """Convert a scene's camera to what the operators read; each camera once, as it takes 0.3 ms.
@@ -60,7 +55,7 @@ def pinhole_of(camera: Camera, blur: float) -> Pinhole:
         (camera.fx, camera.fy),
         (camera.cx, camera.cy),
         (camera.width, camera.height),
-        nearest_shown(camera),
+        max(_NEAR * camera.near, _LEAST_NEAR * camera.far),
         skew=camera.skew,
         blur=blur,
         margin=MARGIN * max(camera.width, camera.height),

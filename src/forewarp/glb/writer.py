@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from forewarp.fields.curves import PADDING
-from forewarp.fields.moving import MARGIN, MovingGaussians, NodeMotion, nearest_shown
+from forewarp.fields.moving import MARGIN, MovingGaussians, NodeMotion
 from forewarp.glb import meshopt
 from forewarp.glb.container import (
     BYTE,
@@ -119,13 +119,10 @@ def _camera(camera: Camera) -> dict:
 
 
 def _setting(setting: Setting, gaussians: MovingGaussians) -> dict:
-    start = setting.cameras[0]
     return {
         "seconds": setting.seconds,
         "background": list(setting.background),
         "focus": setting.focus.tolist(),
-        "near": nearest_shown(start),
-        "far": start.far,
         "blur": gaussians.blur,
         "cutoff": math.exp(LEAST_LOG),
         "margin": MARGIN,

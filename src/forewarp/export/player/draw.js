@@ -218,7 +218,7 @@ void main() {
   drawn = vec4(alpha * shade.rgb, alpha);
 }`;
 
-// Return a camera's focal lengths and middle for an image of another size, in which its own is wholly seen.
+// Return what a camera's lens is for an image of another size, in which its own is wholly seen.
 function fitted(lens, width, height) {
   const scale = Math.min(width / lens.width, height / lens.height);
   return {
@@ -230,6 +230,7 @@ function fitted(lens, width, height) {
     size: [width, height],
     skew: (lens.skew ?? 0) * scale,
     bend: lens.lens ?? [0, 0, 0, 0, 0],
+    near: lens.near,
   };
 }
 
@@ -427,7 +428,7 @@ class Renderer {
     gl.uniformMatrix3fv(place("rotation"), true, [...right, ...down, ...ahead]);
     gl.uniform3fv(place("eye"), eye);
     for (const name of ["focal", "middle", "size"]) gl.uniform2fv(place(name), view[name]);
-    gl.uniform1f(place("near"), this.scene.near);
+    gl.uniform1f(place("near"), view.near);
   }
 
   bind(program, name, unit, texture, kind = this.gl.TEXTURE_2D) {

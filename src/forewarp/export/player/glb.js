@@ -149,9 +149,10 @@ function camerasOf(gltf, matrices, turn) {
   return gltf.nodes.flatMap((node, number) => {
     const camera = gltf.cameras?.[node.camera], m = matrices[number];
     if (!camera?.perspective) return [];
-    const { yfov, aspectRatio = 1 } = camera.perspective, height = 400 / Math.min(1, aspectRatio);
+    const { yfov, aspectRatio = 1, znear, zfar } = camera.perspective, height = 400 / Math.min(1, aspectRatio);
     const f = height / (2 * Math.tan(yfov / 2)), width = aspectRatio * height;
     const lens = { width, height, fx: f, fy: f, cx: width / 2, cy: height / 2, ...camera.extras };
+    lens.near = Math.max(znear / 10, zfar / 50);
     return [{
       lens, time: lens.time, eye: turned(m[12] - turn[12], m[13] - turn[13], m[14] - turn[14]),
       right: turned(m[0], m[1], m[2]), down: turned(-m[4], -m[5], -m[6]), ahead: turned(-m[8], -m[9], -m[10]),
@@ -193,8 +194,8 @@ function readScene(bytes) {
     },
     timeOffsets: timeOffsets && { times: read(timeOffsets.times), offsets: read(timeOffsets.offsets) },
     colorOverTime: (motion.colorOverTime ?? []).map(read), opacityOverTime: (motion.opacityOverTime ?? []).map(read),
-    canonicalTime: motion.canonicalTime ?? 0, seconds: motion.seconds ?? 4, background: motion.background ?? [1, 1, 1],
-    focus: motion.focus ?? [0, 0, 0], near: motion.near ?? 0.01, margin: motion.margin ?? 0.125, blur: motion.blur ?? 0.1,
+    canonicalTime: motion.canonicalTime, seconds: motion.seconds ?? 4, background: motion.background ?? [1, 1, 1],
+    focus: motion.focus ?? [0, 0, 0], margin: motion.margin ?? 0.125, blur: motion.blur,
     up: [turn[1], turn[5], turn[9]], cameras: camerasOf(gltf, matrices, turn),
   };
 }

@@ -147,7 +147,7 @@ class Player {
 
   // Stand where a camera stands.
   stand({ eye, right, down, ahead }) {
-    const { focus, near } = this.scene;
+    const { scene: { focus }, lens: { near } } = this;
     Object.assign(this, { eye: [...eye], right: unit(right), down: unit(down), ahead: unit(ahead) });
     const along = dot(add(focus, eye, -1), this.ahead);
     this.away = along > 2 * near ? along : Math.max(Math.hypot(...add(focus, eye, -1)), 2 * near);
@@ -194,7 +194,7 @@ class Player {
   approach(factor) {
     this.ride(false);
     const target = add(this.eye, this.ahead, this.away);
-    this.away = Math.max(this.away * factor, 2 * this.scene.near);
+    this.away = Math.max(this.away * factor, 2 * this.lens.near);
     this.eye = add(target, this.ahead, -this.away);
     this.changeView();
   }
