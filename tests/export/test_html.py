@@ -20,6 +20,7 @@ from forewarp.evaluation.layers import LAYERS, layer_of
 from forewarp.export.glb import packed_scene
 from forewarp.export.html import _PLAYER, page, poster
 from forewarp.export.tracks import Source
+from forewarp.fields.moving import pinhole_of
 from forewarp.glb import meshopt
 from forewarp.metrics.image import psnr
 from forewarp.scene.camera import Lens, orbit
@@ -378,6 +379,12 @@ def test_lenses_bend_what_it_draws(browser, particles, tmp_path):
     assert psnr(got, rendered(particles, camera, 0.3)) > 50
     assert psnr(got, rendered(particles, replace(camera, lens=None), 0.3)) < 38
     assert psnr(got, rendered(particles, replace(camera, skew=0.0), 0.3)) < 38
+    for k, p in [((0.6, 0.2, 0.0), (0.0, 0.0)), ((-0.3, 0.08, 0.0), (0.02, -0.01)), (lens.k, lens.p)]:
+        for focal in (50.0, 90.0, 200.0):
+            wide = replace(camera, fx=focal, fy=1.1 * focal, lens=Lens(k, p))
+            view = {"bend": [*k, *p], "focal": [wide.fx, wide.fy], "skew": wide.skew, "size": [120, 120]}
+            reach = tab.page.evaluate("reachOf", view | {"middle": [wide.cx, wide.cy]})
+            assert reach == pytest.approx(pinhole_of(wide, 0.1).reach, rel=1e-4)
     assert tab.errors == []
     tab.page.close()
 

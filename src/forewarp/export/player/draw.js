@@ -234,28 +234,42 @@ function fitted(lens, width, height) {
   };
 }
 
-// Bend a point of the plane at distance 1 as a lens (k1, k2, k3, p1, p2) does.
-function bent([k1, k2, k3, p1, p2], x, y) {
-  const r2 = x * x + y * y, scale = 1 + r2 * (k1 + r2 * (k2 + r2 * k3));
-  return [x * scale + 2 * p1 * x * y + p2 * (r2 + 2 * x * x), y * scale + 2 * p2 * x * y + p1 * (r2 + 2 * y * y)];
+// Bend a point of the plane at distance 1 as a lens (k1, k2, k3, p1, p2) does; with what x and y gain by x and y.
+function bent([k1, k2, k3, p1, p2], [x, y]) {
+  const r2 = x * x + y * y, scale = 1 + r2 * (k1 + r2 * (k2 + r2 * k3)), slope = 2 * (k1 + r2 * (2 * k2 + r2 * 3 * k3));
+  return {
+    x: x * scale + 2 * p1 * x * y + p2 * (r2 + 2 * x * x), y: y * scale + 2 * p2 * x * y + p1 * (r2 + 2 * y * y),
+    xx: scale + slope * x * x + 2 * p1 * y + 6 * p2 * x, xy: slope * x * y + 2 * p1 * x + 2 * p2 * y,
+    yy: scale + slope * y * y + 2 * p2 * x + 6 * p1 * y,
+  };
+}
+
+// Return the point that a lens bends to (x, y), by Newton's method from the axis; where the lens shows none, as
+// it folds before, one on this side of the fold.
+function straightened(bend, [x, y]) {
+  let place = [0, 0], here = bent(bend, place), pace = 1;
+  for (let step = 0; step < 40; step++) {
+    const { xx, xy, yy } = here, dx = here.x - x, dy = here.y - y, factor = pace / (xx * yy - xy * xy);
+    if (Math.hypot(dx, dy) < 1e-12) break;
+    const tried = [place[0] - factor * (yy * dx - xy * dy), place[1] - factor * (xx * dy - xy * dx)];
+    const there = bent(bend, tried), regular = there.xx > 0 && there.xx * there.yy > there.xy * there.xy;
+    const closer = regular && Math.hypot(there.x - x, there.y - y) < Math.hypot(dx, dy);
+    if (closer) [place, here] = [tried, there];
+    pace = closer ? Math.min(2 * pace, 1) : pace / 2;
+  }
+  return place;
 }
 
 // Return the squared distance from the axis from which on a view shows nothing: somewhat beyond its border.
 // Farther out the lens's polynomial may fold points back into the image.
-function reachOf({ bend, focal, middle, size }) {
+function reachOf({ bend, focal, middle, size, skew }) {
   if (!bend.some(Boolean)) return 1e8;
   let most = 0;
   for (let k = 0; k <= BORDER; k++) {
     const [u, v] = size.map((side) => (k / BORDER) * side);
-    for (const pixel of [[u, 0], [u, size[1]], [0, v], [size[0], v]]) {
-      const goal = pixel.map((value, i) => (value - middle[i]) / focal[i]);
-      let place = goal;
-      for (let step = 0; step < 20; step++) {
-        const [x, y] = bent(bend, ...place);
-        const next = [place[0] + goal[0] - x, place[1] + goal[1] - y];
-        if (!(Math.hypot(...next) < 2 * Math.hypot(...goal))) break; // beyond the fold
-        place = next;
-      }
+    for (const [across, down] of [[u, 0], [u, size[1]], [0, v], [size[0], v]]) {
+      const y = (down - middle[1]) / focal[1], x = (across - middle[0] - skew * y) / focal[0];
+      const place = straightened(bend, [x, y]);
       most = Math.max(most, place[0] ** 2 + place[1] ** 2);
     }
   }
