@@ -282,12 +282,6 @@ function timeBasis({ canonicalTime }, time, count) {
   return Float32Array.from({ length: Math.max(count, 1) }, (_, k) => at(k + 1));
 }
 
-// Return the logits of opacity, to which opacity over time is added; they are kept finite.
-function logitsOf({ logits, opacity }) {
-  const logit = (o) => Math.log(o / (1 - o));
-  return logits ?? opacity.map((o) => logit(Math.min(Math.max(o, 1 / 1020), 1 - 1 / 1020)));
-}
-
 class Renderer {
   constructor(canvas, scene) {
     const options = { alpha: false, antialias: false, depth: false, powerPreference: "high-performance" };
@@ -353,7 +347,7 @@ class Renderer {
       if (last) for (let i = 0; i < count; i++) room[4 * i + 3] = last[i];
       gl.texSubImage3D(gl.TEXTURE_2D_ARRAY, 0, 0, 0, layer++, ROW, rows, 1, gl.RGBA, gl.FLOAT, room);
     };
-    put(scene.places, 3, scene.opacityOverTime.length ? logitsOf(scene) : scene.opacity);
+    put(scene.places, 3, scene.opacityOverTime.length ? scene.logits : scene.opacity);
     put(scene.quaternions, 4);
     put(scene.scales, 3);
     scene.links.forEach((links, group) => {
