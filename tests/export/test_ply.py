@@ -9,7 +9,8 @@ import trimesh
 from plyfile import PlyData
 from scipy.special import expit, logit
 
-from forewarp.export.ply import along_curve, packed_columns, splat_columns, write_ply
+from forewarp.export.ply import packed_columns, splat_columns, write_ply
+from forewarp.glb.writer import morton
 from forewarp.ops.gaussians import FLAT, Gaussians
 from forewarp.scene.camera import mean_up
 from forewarp.scene.cloud import Ellipsoids
@@ -173,7 +174,7 @@ def test_compressed_files_are_as_exact_as_their_bits_and_look_the_same(particles
     files = sorted(file.name for file in small.rglob("*.ply"))
     assert files == [f"frame_{i:04d}.compressed.ply" for i in range(len(TIMES))]
     assert about["degree"] == about["degree of the run"] == 2  # columns of degree 3 would be 0
-    order = along_curve(particles.method.template().centers.numpy())
+    order = morton(particles.method.template().centers.numpy()).argsort(kind="stable")
     for number, (time, camera) in enumerate(zip(TIMES, particles.cameras)):
         whole = read(plain / "frames" / f"frame_{number:04d}.ply")
         table = unpacked(small / "frames" / f"frame_{number:04d}.compressed.ply")

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from forewarp.export.tracks import Progress, Source, tracks_of
+from forewarp.glb.writer import morton
 from forewarp.methods.method import HasBounds, HasSolid
 from forewarp.ops.gaussians import FLAT
 from forewarp.scene.box import Box, Lattice
@@ -148,16 +149,6 @@ def packed_columns(columns: Mapping[str, np.ndarray]) -> dict[str, dict[str, np.
     return elements
 
 
-def along_curve(points: np.ndarray) -> np.ndarray:
-    """Order points (N, 3) along a Z-order curve, so that what follows each other lies close: rows (N,)."""
-    low, size = points.min(0), max(float(np.ptp(points, 0).max()), 1e-30)
-    cells = ((points - low) / size * 1023).astype(np.uint64)
-    code = np.zeros(len(points), np.uint64)
-    for bit, axis in np.ndindex(10, 3):
-        code |= (cells[:, axis] >> np.uint64(bit) & np.uint64(1)) << np.uint64(3 * bit + axis)
-    return code.argsort(kind="stable")
-
-
 def header_comments(source: Source, rotation: Tensor) -> list[str]:
     """Return what viewers read in a header: ``Vertical axis: z``, as nerfstudio and Brush write it, where the
     images' mean upward direction, after a rotation (3, 3), is along an axis or against it; else nothing.
@@ -209,7 +200,7 @@ def export_ply(
     template = source.method.template()
     own_degree = math.isqrt(template.harmonics.shape[1]) - 1
     degree = min(degree, own_degree) if compressed else degree
-    order = along_curve(template.centers.cpu().numpy()) if compressed else slice(None)
+    order = morton(template.centers.cpu().numpy()).argsort(kind="stable") if compressed else slice(None)
     for number, (file, time) in enumerate(zip(files, source.times)):
         cloud = source.method.ellipsoids(time)
         columns = splat_columns(cloud if up == "world" else cloud.turned(rotation), degree)
