@@ -35,8 +35,13 @@ def test_a_film_of_a_layer_has_the_masks_of_the_whole_scene(tmp_path, monkeypatc
     monkeypatch.setattr(type(module.method), "in_motion", lambda self, frames: rows)
     method, config = module.method, OmegaConf.load(CONF / "render.yaml")
     config.update({"masks": "true", "layer": "moving", "frames": 3, "size": 24, "format": "png"})
+    older = [tmp_path / "videos" / name / "0003.png" for name in ("fixed_moving", "fixed_moving_masks")]
+    for file in older:  # of a longer film
+        file.parent.mkdir(parents=True)
+        file.write_bytes(b"")
     film = write_film(config, SimpleNamespace(folder=tmp_path, datamodule=DATA), module)
     assert film == tmp_path / "videos" / "fixed_moving"
+    assert not any(file.exists() for file in older)
     assert len(module.method.means) == int(rows.sum())
     masks = [iio.imread(tmp_path / "videos" / "fixed_moving_masks" / f"{i:04d}.png") for i in range(3)]
     camera = DATA.targets("test")[0].frame.camera.resized(24, 24)

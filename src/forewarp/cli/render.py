@@ -88,9 +88,10 @@ def pictures_of(config, module, datamodule, masks: Path):
 
 def with_masks(pictures, method, shots, moving, folder: Path):
     """Yield pictures; write for each which of its pixels are mostly what moves, ``folder/0000.png`` ..."""
-    from forewarp.drawing.images import write_png
+    from forewarp.drawing.images import keep_first, write_png
     from forewarp.evaluation.images import moving_share
 
+    keep_first(folder, len(shots))
     for number, (picture, (camera, time)) in enumerate(zip(pictures, shots)):
         share = moving_share(method, moving, camera, time)
         write_png(folder / f"{number:04d}.png", (share > HALF).float())

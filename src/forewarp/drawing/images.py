@@ -250,9 +250,10 @@ def write_video(path: Path, images: Iterable[Tensor], *, fps: float) -> Path:
         the file or the folder.
     """
     if path.suffix == ".png":
-        folder = path.with_suffix("")
-        for number, image in enumerate(images):
-            write_png(folder / f"{number:04d}.png", image)
+        folder, count = path.with_suffix(""), 0
+        for count, image in enumerate(images, 1):
+            write_png(folder / f"{count - 1:04d}.png", image)
+        keep_first(folder, count)
         return folder
     frames = map(to_bytes, images)
     with written_whole(path) as beside:
@@ -261,6 +262,13 @@ def write_video(path: Path, images: Iterable[Tensor], *, fps: float) -> Path:
         else:
             _write_mp4(beside, frames, fps)
     return path
+
+
+def keep_first(folder: Path, count: int) -> None:
+    """Delete what an earlier, longer series left: ``0000.png`` ... from ``count`` on."""
+    for path in folder.glob("[0-9][0-9][0-9][0-9].png"):
+        if int(path.stem) >= count:
+            path.unlink()
 
 
 def _write_mp4(path: Path, frames: Iterable[np.ndarray], fps: float) -> None:
