@@ -37,6 +37,7 @@ make reproduce-tables [DATA=DATASETS], make ablations, make effects. Runs withou
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from glob import glob
 from importlib import import_module
 from pathlib import Path
@@ -212,9 +213,10 @@ def _render(config: DictConfig, row: dict, media) -> None:
     if config.path is None and isinstance(module.method, HasMovingGaussians):
         from forewarp.export.html import player_of, script_digests
 
-        text, _ = player_of(source_of(run, module, method_name(saved), []))
-        if media.play(text, script_digests(), room_of(row, media, float(config.megabytes))):
-            return
+        with suppress(ValueError):  # of particles of which nobody sees any
+            text, _ = player_of(source_of(run, module, method_name(saved), []))
+            if media.play(text, script_digests(), room_of(row, media, float(config.megabytes))):
+                return
     if media.video is not None:
         return
     if not len(targets):

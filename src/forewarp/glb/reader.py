@@ -14,7 +14,7 @@ import torch
 
 from forewarp.fields.curves import KINDS, PADDING, Curve
 from forewarp.fields.moving import MARGIN, MovingGaussians, NodeMotion
-from forewarp.files import MOST_ARRAYS, MOST_CONFIG, read_bytes
+from forewarp.files import MOST_CONFIG, read_bytes
 from forewarp.glb import meshopt
 from forewarp.glb.container import CHUNKS, COMPONENTS, COMPRESSION, ELEMENTS, MAGIC, VERSION
 from forewarp.glb.writer import FORMAT, MOTION, SPLATS, Setting
@@ -24,6 +24,7 @@ from forewarp.scene.camera import Camera, Lens
 _KNOWN = {COMPRESSION, SPLATS, MOTION}  # extensions that a file may require
 FEATURES: frozenset[str] = frozenset()  # names that a file may list of what a reader must know
 # At most: degree of the harmonics, cosines over time, accessors of links.
+_MOST = 1 << 28  # bytes of the file, and of all its arrays: some 200,000 particles of degree 3
 _DEGREES, _COSINES, _LINKS = 3, 64, 16
 FARTHEST = 0.2  # of all time: no image's time is off by more
 _ONE_FILTER = {"NONE": None, "EXPONENTIAL": None, "QUATERNION": 8}  # the stride that a filter asks for
@@ -136,7 +137,7 @@ class Container:
         self.description, self.binary = Fields(_parsed(bytes(text)), "glTF"), binary
         self.accessors, self.views = (self.description.parts(key) for key in ("accessors", "bufferViews"))
         self._decoded: dict[int, np.ndarray] = {}
-        self._room = MOST_ARRAYS
+        self._room = _MOST
 
     def array(self, number: Any, kind: str, count: int | None = None, *, place: str) -> np.ndarray:
         """Return an accessor's rows (N, 1), (N, 3) or (N, 4): whole numbers, or float32 that are finite.
@@ -152,7 +153,7 @@ class Container:
                 f"{place}: expected one of {len(self.accessors)} accessors, but got {_short(number)}"
             )
         accessor, width = self.accessors[number], {name: n for n, name in ELEMENTS.items()}[kind]
-        rows = accessor.whole("count", 1, MOST_ARRAYS)
+        rows = accessor.whole("count", 1, _MOST)
         if accessor.text("type") != kind or (count is not None and rows != count):
             wanted = f"{'rows' if count is None else count} of {kind}"
             raise ValueError(f"{place}: expected {wanted}, but got {rows} of {accessor.text('type')}")
@@ -191,7 +192,7 @@ class Container:
         """Count the bytes of an array before there is one."""
         self._room -= size
         if self._room < 0:
-            raise ValueError(f"{place}: expected at most {MOST_ARRAYS} bytes in all, but got more")
+            raise ValueError(f"{place}: expected at most {_MOST} bytes in all, but got more")
 
     def _bytes(self, part: Fields) -> memoryview:
         part.whole("buffer", 0, 0)
@@ -203,7 +204,7 @@ class Container:
     def _uncompressed(self, part: Fields) -> np.ndarray:
         data, stride = bytes(self._bytes(part)), part.whole("byteStride", 4, 256)
         count, mode, name = (
-            part.whole("count", 1, MOST_ARRAYS),
+            part.whole("count", 1, _MOST),
             part.text("mode"),
             part.text("filter", "NONE"),
         )
@@ -249,7 +250,7 @@ def read(path: Path) -> Contents:
 
     Cost: about a microsecond for each 16 bytes of compressed arrays.
     """
-    data = read_bytes(path, MOST_ARRAYS)
+    data = read_bytes(path, _MOST)
     try:
         return _scene(Container(data))
     except ValueError as error:
