@@ -285,6 +285,7 @@ WRONG = {
     "a list for an object": (setter(["meshes", 0], []), r"meshes[0]: expected an object, but got []"),
     "no lens": (setter(["cameras", 0, "extras", "lens"], [1]), "lens: expected 5 numbers, but got [1]"),
     "no image": (setter(["cameras", 0, "extras", "width"], 0), "width: expected a whole number from 1"),
+    "a scaled scene": (setter(["nodes", 0, "scale"], [2, 2, 2]), "scale: expected a rotation alone"),
     "no rotation": (setter(["nodes", 0, "rotation"], [0, 0, 0, 0]), "expected a unit quaternion"),
     "no node": (setter(["nodes", 0, "children"], [10**6]), "children: expected nodes, but got 1000000"),
 }

@@ -419,6 +419,9 @@ def _offsets(container: Container, motion: Fields) -> tuple[list[float], list[fl
 def _cameras(description: Fields, scene: int) -> tuple[list[Camera], torch.Tensor]:
     """Return the cameras below the scene's node, and the rotation of that node."""
     nodes, cameras = description.parts("nodes"), description.parts("cameras")
+    for key in ("matrix", "translation", "scale"):
+        if key in nodes[scene]:
+            raise ValueError(f"{nodes[scene].place}.{key}: expected a rotation alone, but got this, too")
     found = []
     for number in nodes[scene].items("children", []):
         if type(number) is not int or not 0 <= number < len(nodes):
