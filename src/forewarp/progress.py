@@ -138,5 +138,7 @@ class Counted:
         return self
 
     def __exit__(self, *error) -> None:
+        if self.first is None and error[0] is not None:
+            return  # refused before anything was done
         spent = time_text(time.perf_counter() - self.begin)
         self.line.close(self.done / self.total, f"{self.done}/{self.total} in {spent}")

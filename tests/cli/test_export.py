@@ -46,7 +46,10 @@ def test_it_writes_what_the_run_has_into_its_folder_and_says_so(forewarp, ok, fi
         (["times=[1,0]"], "times: expected each later than the one before, but got [1, 0]"),
         (["times=[]"], "times: expected numbers in [0, 1], but got []"),
         (["points=9"], "points: expected an option of format=ply (degree, up, compressed); leave it out"),
-        (["format=glb", "times=3"], "times: expected an option of format=glb (quality, seconds)"),
+        (
+            ["format=glb", "times=3"],
+            "times: expected none with format=glb, which holds all times; leave it out",
+        ),
         (["format=glb", "quality=high"], "quality: expected compact or lossless, but got high"),
         (["degree=4"], "degree: expected a whole number from 0 to 3, but got 4"),
         (["format=npz", "points=0"], "points: expected a whole number from 1 to 1000000, but got 0"),

@@ -87,9 +87,12 @@ def summary(about: dict) -> str:
 
     >>> summary({"bytes": {"a": 2_000_000, "b": 500_000}, "vertices": [7200, 72]})
     '2 files, 2.5 MB, at least 72 vertices each'
+    >>> summary({"bytes": {"a": 40_624}})
+    '1 file, 41 kB'
     """
     count, size = len(about["bytes"]), sum(about["bytes"].values())
-    text = f"{count} file{'s' * (count != 1)}, {size / 1e6:.1f} MB"
+    amount = f"{size / 1e6:.1f} MB" if size >= 1e5 else f"{size / 1e3:.0f} kB"
+    text = f"{count} file{'s' * (count != 1)}, {amount}"
     for what in {"particles", "points", "vertices"} & about.keys():
         number = about[what]
         in_each_file = isinstance(number, list)
@@ -108,8 +111,11 @@ def check(config) -> list[float]:
         raise ValueError(f"format: expected one of {', '.join(FORMATS)}, but got '{config.format}'")
     options = FORMATS[config.format].options
     foreign = {option for form in FORMATS.values() for option in form.options} - set(options)
-    foreign |= set() if FORMATS[config.format].times else {"times"}
     for key in map(key_of, typed_overrides()):
+        if key == "times" and not FORMATS[config.format].times:
+            raise ValueError(
+                f"times: expected none with format={config.format}, which holds all times; leave it out"
+            )
         if key in foreign:
             raise ValueError(
                 f"{key}: expected an option of format={config.format} ({', '.join(options)}); leave it out"

@@ -47,7 +47,8 @@ def render(config) -> None:
             f"path={config.path} goes all around, also to where no camera of a capture from one side has "
             "looked; path=swing stays between the training cameras"
         )
-    print(f"written: {write_film(config, *opened(saved))}")
+    file = write_film(config, *opened(saved))
+    print(f"written: {file}" + (f" and {file.with_suffix('')}_masks" if config.masks == "true" else ""))
 
 
 def write_film(config, run, module) -> Path:

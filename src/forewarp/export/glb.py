@@ -67,9 +67,10 @@ def packed_scene(
     gaussians, cameras = source.method.moving().to("cpu"), list(source.cameras)
     shown = seen_in_images(gaussians, source, progress) if quality == COMPACT else None
     rows = rows_in_file(gaussians, shown, moving_in_images(source))
+    progress(len(cameras), len(cameras))
     if not len(rows.order):
         raise ValueError("run: expected particles that can be seen, but got none; train it longer")
-    numbers = [0, *spread(len(cameras), _CAMERAS)]
+    numbers = sorted({0, *spread(len(cameras), _CAMERAS)})
     setting = Setting(
         [cameras[number] for number in numbers],
         source.rotation_to("y"),

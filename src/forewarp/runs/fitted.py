@@ -48,11 +48,17 @@ class Renderable:
     Attributes:
         method: renders and moves points.
         name: of the method, for errors.
+        place: the folder or file that it was opened from.
     """
 
     method: Method | MovingGaussians
     name: str
+    place: Path
     _snapshot: Snapshot | GaussiansSnapshot | None = None
+
+    def __repr__(self) -> str:
+        """Say in a line what it is and where it came from."""
+        return f"{type(self).__name__}({self.place}, {self.name})"
 
     def render(self, camera: Camera, time: float, background: str | Tensor = "white") -> Tensor:
         """Render the scene from a camera at a time: a picture (H, W, 3) in [0, 1], on the CPU.
@@ -92,12 +98,14 @@ class Renderable:
         return self.method
 
 
-@dataclass
+@dataclass(repr=False)
 class Fitted(Renderable):
     """A fitted scene, as ``forewarp.load(folder)`` returns it.
 
     >>> import forewarp
     >>> scene = forewarp.load(fitted_run)
+    >>> scene
+    Fitted(..., forward)
     >>> frame = scene.frames("test")[0]
     >>> picture = scene.render(frame.camera, frame.time)
     >>> picture.shape == (frame.camera.height, frame.camera.width, 3)
@@ -121,6 +129,11 @@ class Fitted(Renderable):
     scene: Scene
 
     @property
+    def place(self) -> Path:
+        """The run's folder."""
+        return self.folder
+
+    @property
     def method(self) -> Method:
         """The fitted method."""
         return self.module.method
@@ -142,7 +155,7 @@ class Fitted(Renderable):
         return getattr(self.scene, split)
 
 
-@dataclass
+@dataclass(repr=False)
 class SceneFile(Renderable):
     """A scene of particles in one file, as ``forewarp.load("scene.glb")`` returns it; no run is needed.
 
@@ -160,6 +173,11 @@ class SceneFile(Renderable):
     background: Tensor
     seconds: float
     name: ClassVar[str] = "particles"
+
+    @property
+    def place(self) -> Path:
+        """The file."""
+        return self.file
 
     @property
     def method(self) -> MovingGaussians:

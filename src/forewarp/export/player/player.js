@@ -374,6 +374,7 @@ function connect(player) {
   };
   byId("whole").hidden = !document.fullscreenEnabled;
   byId("ride").hidden = !player.path;
+  for (const row of document.querySelectorAll("[data-of]")) row.hidden = byId(row.dataset.of).hidden;
   byId("camera").hidden = player.scene.cameras.length < 2;
   byId("layers").hidden = !player.scene.inMotion || player.scene.inMotion === player.scene.count;
   for (const name of ["play", "time", "clock", "trails"]) byId(name).disabled = !player.scene.moving;
@@ -415,8 +416,8 @@ function connect(player) {
     player.rouse();
     const { key, target, ctrlKey, metaKey, altKey, shiftKey } = event;
     if (ctrlKey || metaKey || altKey || keys.open) return;
-    const typed = target.closest?.("input, button") !== null && target.closest !== undefined;
-    if (typed && (key === " " || key in arrows)) return; // a button is pressed, a slider moved
+    const of = (kinds) => Boolean(target.closest?.(kinds));
+    if ((key === " " && of("button")) || (key in arrows && of("input, button"))) return; // pressed, moved
     if (key in arrows) {
       const [x, y] = arrows[key];
       if (shiftKey) player.shift(30 * x, 30 * y);
