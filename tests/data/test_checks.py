@@ -37,6 +37,18 @@ def changed(frames=None, **changes):
     return replace(SCENE, **changes)
 
 
+def moved(share):
+    """The training frames with their principal points moved by a share of the width."""
+    cameras = [replace(f.camera, cx=f.camera.cx + share * f.camera.width) for f in SCENE.train]
+    return tuple(replace(f, camera=camera) for f, camera in zip(SCENE.train, cameras))
+
+
+def named(names):
+    """The training frames in the order of their times, with other names."""
+    frames = sorted(SCENE.train, key=lambda frame: frame.time)
+    return tuple(replace(f, name=name) for f, name in zip(frames, names, strict=True))
+
+
 def ranged(near, far):
     return tuple(replace(f, camera=replace(f.camera, near=near, far=far)) for f in SCENE.train)
 
@@ -51,6 +63,8 @@ def with_alpha(change):
 
 def test_what_fits_together_is_not_doubted(tmp_path):
     assert list(remarks(SCENE)) == []
+    for train in (moved(0.2), named(["0", "1", "2", "3", "4", "5", "10", "11"]), named("abcdefgh")):
+        assert not any("principal" in line or "texts" in line for line in remarks(changed(train=train)))
     points = torch.rand(200, 3, generator=torch.Generator().manual_seed(0)) - 0.5  # an orbit around them
     assert list(remarks(changed(still=points))) == []
     write_video(tmp_path / "toy", near=20.0, far=120.0)
@@ -72,6 +86,11 @@ def test_what_fits_together_is_not_doubted(tmp_path):
             "in 8 of 8 .* fills the edges and not the middle, as if alpha or masks",
         ),
         (changed(with_alpha(lambda alpha: alpha * 0 + 255)), "alpha is opaque in all training images"),
+        (changed(train=moved(0.3)), "principal point lies at 80% of the width and 50% of the height"),
+        (
+            changed(train=named(["0", "1", "10", "11", "2", "3", "4", "5"])),
+            "names as texts.*.10 comes where 2 is due",
+        ),
         (changed(still=torch.full((4, 3), 500.0)), "cameras see 0% of the 4 points that never move"),
     ],
 )

@@ -18,6 +18,7 @@ from forewarp.data.transforms import (
     camera_of,
     check_times,
     left_aside,
+    pose_in,
     times_of,
     with_intrinsics,
 )
@@ -71,6 +72,15 @@ def test_a_matrix_of_intrinsics_is_read_or_told(own, common, focal, told):
     assert (read.cx, read.cy) == (40, 20)
     assert told in " ".join(lines)
     assert bool(lines) == bool(told)
+
+
+def test_axes_of_mitsuba_are_named():
+    pose = {"transform_matrix": np.eye(4).tolist()}
+    assert pose_in(Entry("t.json", pose, common={"from_mitsuba": False}), None, False).shape == (4, 4)
+    with pytest.raises(
+        SceneError, match="from_mitsuba: expected poses in OpenGL's axes.*negate the first and"
+    ):
+        pose_in(Entry("t.json", pose, common={"from_mitsuba": True}), None, False)
 
 
 def test_an_angle_of_upright_images_is_of_the_width_or_as_told():
@@ -142,6 +152,8 @@ def test_a_vertical_angle_that_is_none_is_told_and_never_refused(angle):
         (["a/1", "a/01", "b/7"], [0.0, 0.5, 1.0]),  # one number twice: no frame's
         (["rgb/1305031102.9", "rgb/1305031103.15", "rgb/1305031103.4"], [0, 0.5, 1]),  # seconds
         (["7.500000", "8.000000", "9.500000"], [0, 0.25, 1]),
+        (["PXL_20240501_235959500", "PXL_20240502_000000500", "PXL_20240502_000003500"], [0, 0.25, 1]),
+        (["frame_00001_0", "frame_00001_1", "frame_00003_0", "frame_00003_1"], [0, 0, 1, 1]),  # faces
         (["1.0001", "1.0002", "2.0001", "2.0002"], [0, 1, 0, 1]),  # camera and frame
     ],
 )

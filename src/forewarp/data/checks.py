@@ -11,6 +11,7 @@ from torch import Tensor
 from forewarp.data.cameras import nine_pixels
 from forewarp.data.directions import common_point
 from forewarp.data.files import mismatch
+from forewarp.data.images import in_order
 from forewarp.scene.box import Box, Lattice
 from forewarp.scene.camera import Camera, focus_point
 from forewarp.scene.frame import Frame, Scene, sightings, spread
@@ -22,6 +23,7 @@ _SIDE, _HOLLOW = 0.5, 0.33  # of one whose subject crosses edges: at two opposit
 _WITHIN = 5  # points along a side of the box that cameras are asked for
 _FAINT = 8  # of 255: alpha that is nowhere above it was written as 0 and 1
 _WIDEST, _ZOOMED = 130, 1.25  # degrees of a pinhole camera; focal lengths of test and training images
+_ASIDE = 0.25  # share of a side by which a principal point is far from the middle
 _STRETCHED, _SAME_PLACE = 1.25, 1e-9  # sides of a pixel; share of the cameras' distance from the origin
 _AROUND = 2  # half a side of a subject's box in distances of the farthest camera from what they look at
 _CUT_OFF, _FEW = 0.1, 0.5  # share of the subject beyond the box; of pixels and points that is too few
@@ -44,7 +46,7 @@ def remarks(scene: Scene) -> Iterator[str]:
     That is a range or box without the point that all cameras look at, or without a part of the subject, or
     one far wider than all cameras; inverted, empty or opaque alpha and masks; masks that leave little; points
     that no camera sees; cameras in one place, no pinholes, or of test images in other units; test images of
-    times beyond those of training.
+    times beyond those of training, or in another order than the names' numbers.
 
     Raises:
         SceneError: if no training image shows anything.
@@ -55,6 +57,13 @@ def remarks(scene: Scene) -> Iterator[str]:
     aside = list(_pinholes(scene)) or list(_too_wide(scene, aim))
     aside = aside or ([] if aim is None else list(_aimed(scene, aim)))
     yield from aside or _of_test_images(scene)
+    names = [frame.name for frame in sorted(scene.train, key=lambda frame: frame.time)]
+    if names == sorted(names) != (numbered := in_order(names)):
+        got, due = next(pair for pair in zip(names, numbered) if pair[0] != pair[1])
+        yield (
+            f"times follow the images' names as texts, not their numbers ({got} comes where {due} is due); "
+            "count them in the order of the numbers"
+        )
     beyond = [frame.time for frame in scene.test if not scene.times[0] <= frame.time <= scene.times[-1]]
     if scene.test and len(beyond) == len(scene.test):
         yield (
@@ -85,10 +94,20 @@ def remarks(scene: Scene) -> Iterator[str]:
 
 
 def _pinholes(scene: Scene) -> Iterator[str]:
-    """Say that cameras stand in one place, have no square pixels, or see more than a pinhole camera shows."""
+    """Say that cameras stand in one place, have their middle far aside or no square pixels, or see more than
+    a pinhole camera shows.
+    """
     places = torch.stack([frame.camera.center for frame in scene.train])
     if len(places) > 1 and float((places - places[0]).abs().max()) <= _SAME_PLACE * float(places.abs().max()):
         yield "training cameras all stand in one place, which tells nothing of depth; compare their poses"
+    cameras = [frame.camera for frame in scene.train]
+    across = float(torch.tensor([camera.cx / camera.width for camera in cameras]).median())
+    down = float(torch.tensor([camera.cy / camera.height for camera in cameras]).median())
+    if max(abs(across - 0.5), abs(down - 0.5)) > _ASIDE:
+        yield (
+            f"the principal point lies at {across:.0%} of the width and {down:.0%} of the height, as of "
+            "images that were cropped since; subtract what was cut off from cx and cy"
+        )
     stretched = [frame.camera.fy / frame.camera.fx for frame in scene.train]
     if not 1 / _STRETCHED < (ratio := float(torch.tensor(stretched).median())) < _STRETCHED:
         yield f"pixels are {ratio:.3g} times as wide as high, by their focal lengths; compare both"

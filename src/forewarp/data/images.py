@@ -10,6 +10,7 @@ import weakref
 from collections import OrderedDict
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from datetime import datetime, timezone
 from pathlib import Path
 from typing import BinaryIO
 
@@ -49,6 +50,8 @@ _COLORED = 32  # of 255: difference of channels of a mask with colours; all of a
 _NUMBERED = 15  # a mask nowhere above it holds numbers of objects
 # A number in a name; seconds, as of TUM's data or ROS, are Unix time, or fill the name to the microsecond.
 _NUMBER = r"((?<!\d)\d{9,10}\.\d+|(?<![^/])\d+\.(?:\d{6}|\d{9})(?=$|\.[A-Za-z])|\d+)"
+# Date and time of day, with or without thousandths of a second, as phones name pictures.
+_DATED = re.compile(r"(?<!\d)((?:19|20)\d{6})[_-]?(\d{6})(\d{3})?(?!\d)")
 
 
 class ImageCache:
@@ -523,12 +526,25 @@ def in_order(things: Iterable, name: Callable[..., str] = str) -> list:
     return sorted(things, key=lambda thing: name_parts(name(thing)))
 
 
+def _seconds(found: re.Match) -> str:
+    """Write date and time of day as seconds since 1970; other digits stay as they are."""
+    day, clock, thousandths = found.groups()
+    try:
+        moment = datetime.strptime(day + clock, "%Y%m%d%H%M%S").replace(tzinfo=timezone.utc)
+    except ValueError:
+        return found[0]
+    return f"{int(moment.timestamp())}.{thousandths or '000'}000"
+
+
 def name_parts(name: str) -> list[str | float]:
-    """Split a name into text, at even places, and numbers; seconds such as 1305031102.1753 are one number.
+    """Split a name into text, at even places, and numbers; seconds such as 1305031102.1753 are one number,
+    and so are date and time of day, as phones write them.
 
     >>> name_parts("cam1/007"), name_parts("rgb/1305031102.1753"), name_parts("12.345678.png")
     (['cam', 1, '/', 7, ''], ['rgb/', 1305031102.1753, ''], ['', 12.345678, '.png'])
+    >>> name_parts("PXL_20240501_235959500"), name_parts("IMG_20240502_000000")
+    (['PXL_', 1714607999.5, ''], ['IMG_', 1714608000.0, ''])
     """
-    parts = re.split(_NUMBER, name)
+    parts = re.split(_NUMBER, _DATED.sub(_seconds, name))
     parts[1::2] = (float(part) if "." in part else int(part) for part in parts[1::2])
     return parts

@@ -63,6 +63,7 @@ _MOST_TIME = 1e20
 _LEAST_SPAN, _MOST_FAR = 0.05, 0.1  # of all times: less is hardly what was meant; share that may be wrong
 _LEAST_UNIT = 0.5  # of all times, that those in [0, 1] span
 _ROUNDING = 1e-6  # beyond 0 and 1
+_FRAME_WORD = re.compile(r"frame[_-]?$", re.IGNORECASE)
 _CAMERA_WORDS = re.compile(r"(cam|camera|view|sensor|c|v)[_-]?$", re.IGNORECASE)
 
 
@@ -262,7 +263,13 @@ def pose_in(entry: Entry, axes: str | None, inverse: bool) -> torch.Tensor:
         entry: the frame.
         axes: of the camera in the file: opengl (or None) or opencv.
         inverse: the file's matrix is world-to-camera.
+
+    Raises:
+        SceneError: for no matrix of a pose, or one in the axes of Mitsuba.
     """
+    if entry.get("from_mitsuba"):
+        advice = "negate the first and the third column of each transform_matrix, and remove the key"
+        raise mismatch(entry.where("from_mitsuba"), "poses in OpenGL's axes", "those of Mitsuba", advice)
     pose = pose_of(entry.own.get("transform_matrix"), entry.where("transform_matrix"))
     pose = np.linalg.inv(pose) if inverse else pose
     return torch.from_numpy(pose if axes == "opencv" else pose @ FLIP)
@@ -428,9 +435,11 @@ def numbers_in(names: Sequence[str]) -> list[float] | None:
     frames = [i for i in places if not all(_CAMERA_WORDS.search(part[i - 1]) for part in parts)]
     if not frames:
         return None
-    numbers = [part[frames[-1]] for part in parts]
+    named = [i for i in frames if all(_FRAME_WORD.search(part[i - 1]) for part in parts)]
+    place = (named or frames)[-1]
+    numbers = [part[place] for part in parts]
     others = [
-        tuple(name.split("/")[:-1]) + tuple(p for i, p in enumerate(part) if i != frames[-1])
+        tuple(name.split("/")[:-1]) + tuple(p for i, p in enumerate(part) if i != place)
         for name, part in zip(names, parts)
     ]
     # Of one camera no number may come twice, or it is no frame's.
