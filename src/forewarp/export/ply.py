@@ -21,7 +21,7 @@ from forewarp.scene.view import Moment
 
 _TYPES = {"float32": "float", "uint32": "uint", "uint8": "uchar"}
 _ALL = 1 << 31  # more points than there are
-_ALONG = 0.98  # cosine of the angle between the upward direction and an axis, from which on that is vertical
+ALONG = 0.98  # cosine of the angle between the upward direction and an axis, from which on that is vertical
 _LOGIT_EPS = 1e-6  # opacities are clamped to [eps, 1 - eps], as their logits are written
 
 
@@ -154,7 +154,7 @@ def header_comments(source: Source, rotation: Tensor) -> list[str]:
     images' mean upward direction, after a rotation (3, 3), is along an axis or against it; else nothing.
     """
     upwards = (rotation @ mean_up(list(source.cameras)).double()).abs()
-    return [f"Vertical axis: {'xyz'[int(upwards.argmax())]}"] if float(upwards.max()) > _ALONG else []
+    return [f"Vertical axis: {'xyz'[int(upwards.argmax())]}"] if float(upwards.max()) > ALONG else []
 
 
 def export_ply(

@@ -9,14 +9,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from forewarp.export.ply import ALONG
 from forewarp.export.tracks import Progress, Source
 from forewarp.scene.camera import mean_up
 from forewarp.scene.cloud import Ellipsoids
 
 _FPS = 24.0  # time codes a second, OpenUSD's own default
-_ALONG = (
-    0.98  # cosine of the angle between the upward direction and an axis, from which on the world is upright
-)
 _REACH = 3.0  # standard deviations that the extent holds
 _UP_AXES = {"y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 
@@ -120,7 +118,7 @@ def upright(source: Source, up: str) -> tuple[str, Tensor | None]:
         return up, source.rotation_to(up)
     upwards = mean_up(list(source.cameras)).double()
     for axis, direction in _UP_AXES.items():
-        if float(upwards @ torch.tensor(direction, dtype=torch.float64)) > _ALONG:
+        if float(upwards @ torch.tensor(direction, dtype=torch.float64)) > ALONG:
             return axis, None
     return "z", source.rotation_to("z")
 
