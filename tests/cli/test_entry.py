@@ -1,7 +1,9 @@
 import errno
+import logging
 import os
 import platform
 import shutil
+from importlib.metadata import version
 from types import SimpleNamespace
 
 import pytest
@@ -39,6 +41,18 @@ def test_help_lists_every_choice(forewarp):
     for group in ("data", "model", "model/view_dependence", "preset", "capture", "experiment", "trainer"):
         (line,) = [line for line in lines if line.split()[:1] == [group]]
         assert line.split()[1::2] == options(group)
+
+
+def test_info_prints_where_options_come_from(ok, monkeypatch):
+    for name, value in (("handlers", []), ("level", logging.WARNING)):  # Hydra sets them
+        monkeypatch.setattr(logging.root, name, value)
+    monkeypatch.setattr(logging, "raiseExceptions", True)
+    assert f"file://{CONF}" in ok("train", "--info", "searchpath").out
+    assert "preset: fast" in ok("train", "--info=defaults-tree", "model=nerf").out
+
+
+def test_the_version_is_forewarps(ok):
+    assert ok("report", "--version").out == f"forewarp {version('forewarp')}\n"
 
 
 def test_missing_conf_is_named(refused, monkeypatch, in_tmp):

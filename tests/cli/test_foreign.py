@@ -1,9 +1,10 @@
-"""The package of docs/extending.md, found on the path alone: a method, an effect, data, and what watches."""
+"""The package of docs/extending.md, found by its entry point: a method, an effect, data, and what watches."""
 
 import importlib
 import json
 import os
 import re
+import shlex
 import shutil
 import signal
 import sys
@@ -51,7 +52,17 @@ exceptions:
 
 def files_of(page):
     """Return the files that the page gives whole: name -> text."""
-    return {name: text for name, text in re.findall(r"^`(mine/\S+)`\n\n```\w+\n(.*?)```", page, re.M | re.S)}
+    named = re.findall(r"^`(mine/\S+|pyproject.toml)`\n\n```\w+\n(.*?)```", page, re.M | re.S)
+    return {name: text for name, text in named}
+
+
+def install(project, site, name="mine"):
+    """Write into ``site`` what pip would of a ``pyproject.toml``: a name and entry points."""
+    (section,) = re.findall(r'^\[project.entry-points."(.*)"\]\n(\w+) = "(.*?)"', project, re.M)
+    written = site / f"{name}-0.1.dist-info"
+    written.mkdir(parents=True)
+    (written / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: 0.1\n")
+    (written / "entry_points.txt").write_text("[{}]\n{} = {}\n".format(*section))
 
 
 def write_toy(folder):
@@ -81,16 +92,17 @@ def work(tmp_path_factory):
     for name, text in (files_of(PAGE.read_text()) | MORE).items():
         (root / name).parent.mkdir(parents=True, exist_ok=True)
         (root / name).write_text(text)
-    for folder in ("mine", "mine/conf"):
-        (root / folder / "__init__.py").touch()
+    (root / "mine" / "__init__.py").touch()
+    install((root / "pyproject.toml").read_text(), root / "site")
     write_toy(root / "scenes" / "toy")
     return root
 
 
 @pytest.fixture(autouse=True)
 def mine(work, monkeypatch):
-    """The package can be imported, and nothing of it remains."""
-    monkeypatch.syspath_prepend(str(work))
+    """The package is installed, and nothing of it remains."""
+    for folder in (work, work / "site"):
+        monkeypatch.syspath_prepend(str(folder))
     monkeypatch.delenv("FOREWARP_TRUST", raising=False)
     importlib.invalidate_caches()
     yield
@@ -99,19 +111,20 @@ def mine(work, monkeypatch):
 
 @pytest.fixture(scope="module")
 def found(work):
-    """Words that find the options and the scene."""
-    return ["hydra.searchpath=[pkg://mine.conf]", f"data.root={work / 'scenes'}"]
+    """Words that find the scene."""
+    return [f"data.root={work / 'scenes'}"]
 
 
 @pytest.fixture(scope="module")
 def originals(work, found):
-    """A finished run of the effect, and one of the method, which finds its options in a folder."""
+    """A finished run of the effect, and one of the method, which is not installed and named as a folder."""
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(str(work))
-        folder = ["--config-dir", str(work / "mine" / "conf"), found[1]]
-        for name, words in (("sheen", [*found, *SHEEN]), ("balls", [*folder, *BALLS])):
+        folder = ["--config-dir", str(work / "mine" / "conf"), *found]
+        for name, words in (("balls", [*folder, *BALLS]), ("sheen", [*found, *SHEEN])):
             done = call("train", *words, f"run={work / name}")
             assert done.status == 0, done.err
+            patch.syspath_prepend(str(work / "site"))
     forget_mine()
     return work
 
@@ -230,5 +243,61 @@ def test_a_method_is_swept_beside_ours_and_reported(ok, found, in_tmp):
     done = ok("train", "--multirun", *found, *SMALL, "data.held_out=2", "model=forward,balls", run)
     assert done.out.count("of 2 held out views") == 2  # and scored
     assert {path.name for path in in_tmp.glob("runs/toy/*-seed*")} == {"forward-seed0", "balls-seed0"}
+    ok("report", "kind=accuracy_time", "runs=runs", "out=page")
+    assert "balls-fast" in (in_tmp / "page" / "accuracy-time.md").read_text()
+
+
+def test_an_installed_package_is_listed_and_its_options_compose(ok, work):
+    """No code of it runs."""
+    listed = ok("train", "--help").out
+    for group, option in {
+        "model": "balls",
+        "experiment": "mine",
+        "data": "mine",
+        "callbacks": "speed",
+    }.items():
+        assert re.search(rf"^  {group} .*\b{option}\b", listed, re.M), group
+    words = ["experiment=mine", "model=balls", "data.scene=x", "data.root=y", "--cfg", "job"]
+    config = yaml.safe_load(call("train", *words).out)
+    assert config["callbacks"]["speed"]["_target_"] == "mine.watch.Speed"
+    assert (config["model"]["count"], "accuracy" in config["callbacks"]) == ("${preset.count}", True)
+    assert "mine" not in sys.modules
+
+
+def test_options_of_ours_win_over_those_of_an_installed_package(work, tmp_path, monkeypatch):
+    (tmp_path / "other" / "conf" / "model").mkdir(parents=True)
+    (tmp_path / "other" / "conf" / "model" / "nerf.yaml").write_text("name: stolen\n")
+    install('[project.entry-points."forewarp.methods"]\nx = "other"', tmp_path, "other")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    assert yaml.safe_load(call("train", "model=nerf", "--cfg", "job").out)["model"]["name"] == "nerf"
+
+
+def test_an_entry_point_without_options_is_told_and_stops_nothing(work, tmp_path, monkeypatch):
+    install('[project.entry-points."forewarp.methods"]\nx = "nowhere.at.all"', tmp_path, "other")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    done = call("train", "model=balls", "data.scene=x", "--cfg", "job")
+    assert done.status in (None, 0)
+    line = "warning: entry point x of forewarp.methods: expected a package that has conf/, but got 'nowhere."
+    assert done.err.startswith(line)
+    assert done.err.count("\n") == 1
+
+
+@pytest.mark.slow
+def test_the_recorded_command_of_a_run_runs_again(ok, found, in_tmp, originals):
+    words = [*BALLS, *found, "data.held_out=2", "callbacks=speed", "run=runs/toy/balls"]
+    for folder, typed in ((in_tmp, words), (originals, None)):
+        if typed is None:  # a run whose options were found by --config-dir
+            shutil.copytree(folder / "balls", in_tmp / "run")
+        else:
+            ok("train", *typed)
+        run = in_tmp / ("run" if typed is None else "runs/toy/balls")
+        config = yaml.safe_load((run / "config.yaml").read_text())
+        name, *recorded = shlex.split(config["command"])
+        assert name == "forewarp-train"
+        recorded = [f"run={run}" if word.startswith("run=") else word for word in recorded]
+        scores = json.loads((run / "metrics.json").read_text())["test"]
+        shutil.rmtree(run)
+        ok("train", *recorded)
+        assert json.loads((run / "metrics.json").read_text())["test"] == scores
     ok("report", "kind=accuracy_time", "runs=runs", "out=page")
     assert "balls-fast" in (in_tmp / "page" / "accuracy-time.md").read_text()

@@ -86,7 +86,7 @@ def test_the_wheel_holds_every_configuration_and_what_reports_need(wheel):
     wanted |= {f"forewarp/export/player/{file.name}" for file in player.iterdir()}
     assert wanted <= names
     assert {name.split("/")[0].partition("-")[0] for name in names} == {"forewarp", "hydra_plugins"}
-    assert "hydra_plugins/forewarp_one_at_a_time.py" in names
+    assert {f"hydra_plugins/forewarp_{name}.py" for name in ("one_at_a_time", "search_path")} <= names
 
 
 @pytest.mark.slow

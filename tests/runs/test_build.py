@@ -58,7 +58,10 @@ def test_auto_takes_what_the_methods_belong_on(machine, accelerator, targets, cu
 
 @pytest.mark.parametrize(
     ("accelerator", "text"),
-    [("gpu", "expected a GPU, but found none; use trainer=cpu"), ("mps", "cpu, gpu or cuda, but got mps")],
+    [
+        ("gpu", "expected a GPU, but found none; use trainer=cpu"),
+        ("mps", "cpu, gpu or cuda, but got mps; Apple's GPUs have no float64"),
+    ],
 )
 def test_a_device_that_is_not_there_is_refused(machine, accelerator, text):
     machine(apple=True)

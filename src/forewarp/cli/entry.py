@@ -12,10 +12,11 @@ import traceback
 import warnings
 from collections.abc import Callable
 from contextlib import suppress
+from importlib.metadata import version
 from pathlib import Path
 
 from forewarp.cli.mistakes import flat, one_line, refuse_dashes, unknown_key, with_run_key
-from forewarp.runs.config_files import configurations, project_root
+from forewarp.runs.config_files import configurations, installed, project_root
 from forewarp.runs.overrides import as_text, typed_overrides
 
 TRACEBACK_VARIABLE = "FOREWARP_TRACEBACK"
@@ -40,6 +41,12 @@ def command(name: str, task: Callable, text: str, *, config: str | None = None) 
         if {"-h", "--help"} & set(sys.argv[1:]):
             print(text.strip() + "\n\n" + choices(project_root() / "conf", config or name), flush=True)
             sys.exit(0)
+        if "--version" in sys.argv[1:]:
+            print(f"forewarp {version('forewarp')}", flush=True)
+            sys.exit(0)
+        if any(argument.partition("=")[0] in ("--info", "-i") for argument in sys.argv[1:]):
+            logging.disable(logging.NOTSET)  # Hydra logs what it prints
+            logging.raiseExceptions = False  # of a reader that closed the output
         sys.argv[1:] = _arguments(name)
         failures = _run(name, task, configurations(), config or name)
     except KeyboardInterrupt:
@@ -172,21 +179,22 @@ def _bug(error: Exception) -> str:
 
 
 def choices(conf: Path, name: str) -> str:
-    """List the options of every group that ``<name>.yaml`` uses, for the help."""
+    """List the options of every group that ``<name>.yaml`` uses, for the help, those of packages too."""
     from forewarp.runs.sections import option_groups
 
-    groups = option_groups(conf)
+    groups = option_groups(conf, *installed().values())
     if name == "train":
         # Chosen by other choices, or by nobody.
         groups = {g: groups[g] for g in groups.keys() - {"dataset", "hydra", "numbers", "paths", "stage/one"}}
         sweeps = sorted((conf.parent / "sweeps").glob("*.yaml"))
-        groups["sweeps"] = [f"{path.stem} (with --multirun)" for path in sweeps]
+        sweeps = [*(path.stem for path in sweeps), *groups.get("sweeps", ())]
+        groups["sweeps"] = [f"{sweep} (with --multirun)" for sweep in sweeps]
     else:
         text = (conf / f"{name}.yaml").read_text()
         groups = {group: groups[group] for group in ("dataset", "trainer") if f"- {group}:" in text}
     lines = [f"  {group:<17} {' | '.join(groups[group])}" for group in sorted(groups) if groups[group]]
     more = [
         "Every other key: --cfg job prints them all; key=value sets one.",
-        "Hydra's own options: --hydra-help.",
+        "Where options come from: --info defaults-tree or searchpath. Hydra's own options: --hydra-help.",
     ]
     return "\n".join((["Choices (group=option):", *lines, ""] if lines else []) + more)

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 
-from forewarp.runs.config_files import configurations
+from forewarp.runs.config_files import configurations, installed
 from forewarp.runs.overrides import key_of
 
 OF_METHODS = ("model", "modules", "objective", "preset", "stage")  # what methods have keys of their own in
@@ -89,7 +89,8 @@ def unknown_key(error: Exception, name: str, arguments: list[str]) -> str | None
                     f"{key}: expected an option of model={config.model.name}, but got one of model={model}; "
                     f"add model={model}, or leave it out"
                 )
-    near = difflib.get_close_matches(key, [*keys, *option_groups(configurations())], 1, cutoff=0.8)
+    groups = option_groups(configurations(), *installed().values())
+    near = difflib.get_close_matches(key, [*keys, *groups], 1, cutoff=0.8)
     advice = f"did you mean {near[0]}?" if near else f"forewarp-{name} --cfg job prints all keys"
     return f"{key}: expected a key of the configuration, but got none of this name; {advice}"
 
@@ -148,6 +149,11 @@ def one_line(error: BaseException) -> str | None:
         otherwise = ", or use launcher=local" if kind == "launcher" else ""
         expected = f"{kind}: expected the package of hydra/{kind}={plugin}, but got none"
         return f"{expected}; install forewarp[sweeps]{otherwise}"
+    trainer = re.search(r"Could not find 'trainer/([^']+)'", str(error))
+    if isinstance(error, HydraException) and trainer:
+        from forewarp.runs.config import instead_of
+
+        return f"trainer: expected auto, cpu or gpu, but got {trainer[1]}; {instead_of(trainer[1])}"
     several = re.match(r"Ambiguous value for argument '([^=]+)=(.*)'", str(error))
     if several and isinstance(error, HydraException):
         key, value = several.groups()

@@ -13,6 +13,7 @@ from hydra.utils import get_object, instantiate
 from omegaconf import DictConfig, OmegaConf
 
 from forewarp.clock import Clock
+from forewarp.runs.config import instead_of
 from forewarp.training.callbacks import StageProgress
 from forewarp.training.schedule import StagePlan, seconds_after, share_out
 from forewarp.training.stages import Run
@@ -141,7 +142,8 @@ def device_for(config: DictConfig) -> torch.device:
     accelerator = config.trainer.accelerator
     if accelerator not in ("auto", "cpu", "gpu", "cuda"):
         raise ValueError(
-            f"trainer.accelerator: expected auto, cpu, gpu or cuda, but got {accelerator}; use trainer=auto"
+            f"trainer.accelerator: expected auto, cpu, gpu or cuda, but got {accelerator}; "
+            + instead_of(accelerator)
         )
     if accelerator in ("gpu", "cuda") and not torch.cuda.is_available():
         raise ValueError("trainer.accelerator: expected a GPU, but found none; use trainer=cpu")

@@ -59,6 +59,14 @@ HOMES = {
     "trainer": ("lightning.Trainer", "lightning.pytorch.Trainer"),
     "logger": ("lightning.pytorch.loggers.",),
 }
+# What other templates have as trainers: why there is none here, and what to type.
+_ONE_PROCESS = (
+    "one process trains a run: use trainer=gpu, and --multirun launcher=joblib trains several runs at once"
+)
+_NO_TRAINERS = {
+    "mps": "Apple's GPUs have no float64, which cameras and the cosine basis need: use trainer=cpu",
+    **dict.fromkeys(("ddp", "ddp_spawn", "ddp_sim", "fsdp", "deepspeed"), _ONE_PROCESS),
+}
 _RESERVED = {"_target_", "_partial_", "_recursive_", "_convert_"}
 # What OmegaConf and PyYAML raise for a text that is no config.
 _UNREADABLE = (
@@ -78,6 +86,11 @@ def hashed(config: DictConfig) -> DictConfig:
     if HASH in str(config.run):
         config.run = str(config.run).replace(HASH, content_hash(config))
     return config
+
+
+def instead_of(trainer: str) -> str:
+    """Say what to type in place of a trainer or accelerator that there is not, and why where it is known."""
+    return _NO_TRAINERS.get(trainer, "use trainer=auto")
 
 
 def content_hash(config: DictConfig, more: Sequence[str] = (), *others: object) -> str:

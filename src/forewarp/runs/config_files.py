@@ -1,4 +1,4 @@
-"""Find ``conf/`` and ``sweeps/``, in a checkout or in the installed package.
+"""Find ``conf/`` and ``sweeps/``, in a checkout or in the installed package, and the ``conf/`` of others.
 
 Without Hydra, whose import takes half a second, until a command composes its configuration.
 """
@@ -6,9 +6,14 @@ Without Hydra, whose import takes half a second, until a command composes its co
 from __future__ import annotations
 
 import os
+import sys
+from functools import cache
+from importlib.metadata import entry_points
+from importlib.util import find_spec
 from pathlib import Path
 
 ROOT_VARIABLE = "FOREWARP_ROOT"
+ENTRY_POINTS = "forewarp.methods"  # the group in which packages name themselves
 PACKAGE = Path(__file__).resolve().parents[1]
 
 
@@ -43,6 +48,40 @@ def configurations() -> Path:
         os.environ[ROOT_VARIABLE] = str(root)
     serve(root / "sweeps")
     return root / "conf"
+
+
+def installed() -> dict[str, Path]:
+    """Return the ``conf/`` of each installed package that declares an entry point of ``ENTRY_POINTS``, by the
+    package's name; warn of a package without one.
+
+    No package is imported here: code of theirs runs where a config that was typed names it.
+    """
+    found = {}
+    for entry in sorted(entry_points(group=ENTRY_POINTS), key=lambda entry: entry.value):
+        package = entry.value.partition(":")[0].strip()
+        if folders := [folder for folder in _folders(package) if folder.is_dir()]:
+            found[package] = folders[0]
+        else:
+            _warn(
+                f"entry point {entry.name} of {ENTRY_POINTS}: expected a package that has conf/, but got "
+                f"{package!r}; install that package again, or mend its pyproject.toml"
+            )
+    return found
+
+
+def _folders(package: str) -> list[Path]:
+    top, *inner = package.split(".")
+    try:
+        spec = find_spec(top)  # of a name with a dot it would import what lies above
+    except (ImportError, ValueError):
+        return []
+    places = (spec and spec.submodule_search_locations) or []
+    return [Path(place, *inner, "conf").resolve() for place in places]
+
+
+@cache  # once a process, however often a config is composed
+def _warn(line: str) -> None:
+    print(f"warning: {line}", file=sys.stderr)
 
 
 def _holds_conf(folder: Path) -> bool:

@@ -26,6 +26,16 @@ def typed_overrides(*, of_sweep: bool = False) -> list[str]:
     return typed if of_sweep else [override for override in typed if not override.startswith(OF_A_SWEEP)]
 
 
+def typed_folders() -> list[str]:
+    """List the words of this job's command line that name folders of options, beside those of packages."""
+    from hydra.core.hydra_config import HydraConfig
+
+    hydra = HydraConfig.get()
+    typed = [source.path for source in hydra.runtime.config_sources if source.provider == "command-line"]
+    searched = [one for one in hydra.overrides.hydra if key_of(one) == "hydra.searchpath"]
+    return [*(f"--config-dir={path}" for path in typed), *searched]
+
+
 def command_line(name: str, overrides: Sequence[str]) -> str:
     """Quote a command so that it can be pasted into a shell.
 

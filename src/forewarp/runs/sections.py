@@ -159,11 +159,16 @@ class ImportlibResourcesConfigSource(
         return resources.files(self.path)
 
 
-def option_groups(conf: Path) -> dict[str, list[str]]:
-    """Return every group in a folder like ``conf/``, with the names of its options."""
-    source = FileConfigSource("forewarp", str(conf))
-    names = {path.relative_to(conf).as_posix() for path in conf.rglob("*") if path.is_dir()} | {*OF_STAGES}
-    for file in conf.rglob("options.yaml"):
-        folder = file.parent.relative_to(conf)
-        names |= {(folder / key).as_posix() for key in parsed(file.read_text(encoding="utf-8")).content}
-    return {name: source.list(name, ObjectType.CONFIG) for name in sorted(names)}
+def option_groups(*folders: Path) -> dict[str, list[str]]:
+    """Return every group in folders like ``conf/``, with the names of its options, in their order."""
+    groups: dict[str, dict[str, None]] = {}
+    for conf in folders:
+        source = FileConfigSource("forewarp", str(conf))
+        inner = (path for path in conf.rglob("*") if path.is_dir() and path.name != "__pycache__")
+        names = {path.relative_to(conf).as_posix() for path in inner} | {*OF_STAGES}
+        for file in conf.rglob("options.yaml"):
+            folder = file.parent.relative_to(conf)
+            names |= {(folder / key).as_posix() for key in parsed(file.read_text(encoding="utf-8")).content}
+        for name in names:
+            groups.setdefault(name, {}).update(dict.fromkeys(source.list(name, ObjectType.CONFIG)))
+    return {name: list(groups[name]) for name in sorted(groups)}

@@ -17,7 +17,7 @@ from omegaconf import DictConfig, OmegaConf
 from forewarp.data.files import LOCK, difference
 from forewarp.files import read_json, read_text, refuse_links, replace_file, write_json
 from forewarp.runs.config import IDENTITY, make_absolute, read_config
-from forewarp.runs.overrides import command_line, typed_overrides
+from forewarp.runs.overrides import command_line, typed_folders, typed_overrides
 from forewarp.training.stages import Run
 
 UNLOCKED = ("videos", "exports", ".page")  # what is written into a run's folder while another may train it
@@ -101,7 +101,9 @@ def claim(config: DictConfig, *, finished: bool = False) -> None:
     path = Path(config.run) / "config.yaml"
     make_absolute(config)
     if config.get("resume") is None:
-        config.command = command_line("train", typed_overrides()) if HydraConfig.initialized() else None
+        is_typed = HydraConfig.initialized()
+        words = [*typed_folders(), *typed_overrides()] if is_typed else []
+        config.command = command_line("train", words) if is_typed else None
     config.resume = None
     if "trust" in config:  # only who runs the command may trust, never a folder
         config.trust = None
