@@ -4,7 +4,6 @@ python docs/images/moving.py runs/hook/particles-fast-seed0 docs/images/hook.gif
 """
 
 import sys
-from dataclasses import replace
 from pathlib import Path
 
 import imageio.v3 as imageio
@@ -13,7 +12,6 @@ import torch
 from PIL import Image, ImageDraw, ImageFont
 
 import forewarp
-from forewarp.scene.camera import focus_point, look_at
 
 SIDE, FOOT = 270, 26  # pixels of a picture's side and of the line below it
 SHOWN = 0.95  # share of a picture's side that is shown, around its middle
@@ -26,22 +24,20 @@ def columns(scene) -> list[list[np.ndarray]]:
     """Return truth, prediction and flight: as many pictures (SIDE, SIDE, 3) uint8 of each."""
     views = scene.frames("test")
     truth = [_cut(_over_white(view.load())) for view in views]
-    drawn = [_cut(_bytes(scene.render(view.camera, view.time))) for view in views]
-    flight = [_cut(_bytes(scene.render(camera, time))) for camera, time in _flight(scene, HELD * len(views))]
+    drawn = [_cut(_bytes(scene.render(view).rgb)) for view in views]
+    flight = [_cut(_bytes(scene.render(pose, time).rgb)) for pose, time in _flight(scene, HELD * len(views))]
     return [[p for p in truth for _ in range(HELD)], [p for p in drawn for _ in range(HELD)], flight]
 
 
 def _flight(scene, count: int):
-    """Yield cameras once around the scene, z upwards, and times there and back again."""
-    frames = scene.frames("train")
-    middle = focus_point([frame.camera for frame in frames])
-    away = torch.stack([frame.camera.camera_to_world[:3, 3] - middle for frame in frames]).norm(dim=-1).mean()
-    up = torch.tensor([0.0, 0.0, 1.0], dtype=middle.dtype)
+    """Yield poses once around the scene, z upwards, and times there and back again."""
+    middle = scene.focus.numpy()
+    away = np.mean([np.linalg.norm(camera.center.numpy() - middle) for camera in scene.cameras])
     for i in range(count):
-        turn = torch.tensor(2 * torch.pi * i / count)
-        aside = torch.stack([turn.cos(), turn.sin(), torch.tensor(RISE)]).to(middle)
-        pose = look_at(middle + away * aside / aside.norm(), middle, up)
-        yield replace(frames[0].camera, camera_to_world=pose), 1 - abs(1 - 2 * i / count)
+        turn = 2 * np.pi * i / count
+        aside = np.array([np.cos(turn), np.sin(turn), RISE])
+        pose = forewarp.look_at(middle + away * aside / np.linalg.norm(aside), middle, up=[0, 0, 1])
+        yield pose, 1 - abs(1 - 2 * i / count)
 
 
 def strip(pictures: tuple[np.ndarray, ...], titles: list[str]) -> Image.Image:

@@ -1,7 +1,17 @@
 """Reconstruct a moving scene from images, and see it from anywhere, at any time.
 
-``forewarp.load(run)`` opens a fitted scene; everything else is imported from the file that defines it.
+``forewarp.load(run)`` opens a fitted scene; ``Camera``, ``look_at`` and ``orbit`` say from where to see it.
+Everything else is imported from the file that defines it.
 """
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from forewarp.scene.camera import Camera, look_at, orbit
+
+__all__ = ["Camera", "load", "look_at", "orbit"]
 
 
 def load(run, *, trust=(), device="cpu"):
@@ -22,3 +32,20 @@ def load(run, *, trust=(), device="cpu"):
     from forewarp.runs.fitted import open_run
 
     return open_run(run, trust=trust, device=device)
+
+
+def __getattr__(name: str):
+    """Import the other names when they are first used, as torch takes a second."""
+    if name == "__version__":
+        from importlib.metadata import version
+
+        return version("forewarp")
+    if name not in __all__:
+        raise AttributeError(f"module 'forewarp' has no attribute '{name}'")
+    from forewarp.scene import camera
+
+    return getattr(camera, name)
+
+
+def __dir__() -> list[str]:
+    return [*__all__, "__version__"]

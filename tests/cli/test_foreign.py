@@ -233,7 +233,7 @@ def test_a_method_is_measured_rendered_and_opened_with_trust(ok, refused, balls)
         load(balls)
     assert "mine" not in sys.modules
     scene = load(balls, trust=["mine"])
-    assert scene.render(scene.frames("test")[0].camera, 0.5).shape == (16, 16, 3)
+    assert scene.render(scene.frames("test")[0]).rgb.shape == (16, 16, 3)
     assert scene.trajectories(scene.matter().points, [0.0, 1.0]).shape == (64, 2, 3)
 
 

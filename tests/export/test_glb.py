@@ -64,8 +64,8 @@ def test_what_no_training_image_shows_is_left_out_of_compact_files_and_not_misse
     scene = forewarp.load(file)
     assert about["particles"] == len(scene.gaussians.means) == len(method.means) - about["left out"]
     for time, camera in list(zip(times, particles.cameras))[:3]:
-        wanted = method.at(Moment(time)).render(View(camera), torch.ones(3)).rgb.clamp(0, 1)
-        error = scene.render(camera, time).reshape(-1, 3) - wanted.detach()
+        wanted = method.at(Moment(time)).render(View(camera), scene.background).rgb.clamp(0, 1)
+        error = scene.render(camera, time).rgb.reshape(-1, 3) - wanted.detach()
         assert float(error.square().mean()) < 1e-4  # 40 dB
     assert export(particles, tmp_path / "all", quality="lossless")[0]["left out"] == 0
 

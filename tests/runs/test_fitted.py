@@ -4,13 +4,20 @@ import json
 import os
 import re
 import shutil
+import subprocess
+import sys
 
+import numpy as np
 import pytest
+import torch
 from omegaconf import OmegaConf
 
+import forewarp
 from forewarp import load
+from forewarp.data.images import composited
 from forewarp.runs.config import saved_config
-from forewarp.runs.fitted import named, opened
+from forewarp.runs.fitted import measure_run, named, opened
+from forewarp.scene.view import Moment, View
 from forewarp.synth.scenes import synthesize
 from tests.support.configs import ROOT
 
@@ -38,11 +45,112 @@ def test_the_script_of_the_docs_runs(fitted, in_tmp):
     shutil.copytree(fitted, in_tmp / re.search(r'load\("(.*?)"\)', script)[1])
     made = {}
     exec(compile(script, str(page), "exec"), made)
-    assert made["picture"].shape == (32, 32, 3)
+    assert (
+        repr(made["drawn"])
+        == "Rendering(rgb=float32 (32, 32, 3), depth=float32 (32, 32), opacity=float32 (32, 32))"
+    )
     assert (in_tmp / "half.png").is_file()
     assert [picture.shape for picture in made["film"]] == [(64, 64, 3)] * 8
     assert made["paths"].shape[1:] == (5, 3)
     assert made["pixels"].shape == (len(made["paths"]), 2)
+
+
+@pytest.mark.parametrize("behind", ["white", "black"])
+def test_a_frame_is_rendered_as_it_is_measured(fitted, tmp_path, behind):
+    run = shutil.copytree(fitted, tmp_path / "run")
+    config = OmegaConf.load(run / "config.yaml")
+    config.data.eval_background = behind
+    OmegaConf.save(config, run / "config.yaml")
+    config = saved_config(str(run), OmegaConf.create({"trust": []}))
+    measure_run(*opened(config), config)
+    measured = {
+        i["name"]: i["scores"]["psnr"] for i in json.loads((run / "per_image.json").read_text())["images"]
+    }
+    scene = load(run)
+    for number, frame in enumerate(scene.frames("test")):
+        truth = composited(frame.load(), scene.background)
+        drawn = scene.render(frame if number else frame.camera, None if number else frame.time).rgb
+        error = (drawn * 255).round() / 255 - (truth * 255).round() / 255
+        assert -10 * float(error.square().mean().log10()) == pytest.approx(measured[frame.name], abs=1e-3)
+    over = [scene.render(frame, background=behind).rgb for behind in ("white", [0.0, 0.0, 0.0], np.ones(3))]
+    assert torch.equal(over[0], over[2])
+    clear = 1 - scene.render(frame).opacity[..., None]
+    unclipped = (over[1] > 0) & (over[0] < 1)
+    torch.testing.assert_close((over[0] - over[1])[unclipped], clear.expand(-1, -1, 3)[unclipped])
+
+
+def test_poses_and_points_may_be_arrays_and_lists(fitted):
+    scene = load(fitted)
+    camera, point = scene.cameras[0], [[0.0, 0.1, 0.2]]
+    pose = camera.camera_to_world
+    wanted = scene.render(camera, 0.5)
+    for given in (pose, pose.float(), pose.numpy(), pose.tolist(), pose.numpy()[::-1][::-1]):
+        torch.testing.assert_close(scene.render(given, 0.5).depth, wanted.depth, rtol=1e-3, atol=1e-3)
+    assert float(wanted.depth[wanted.opacity > 0.9].min()) > camera.near
+    paths = [scene.trajectories(p, t) for p, t in ((point, [0, 1]), (np.array(point), np.array([0.0, 1.0])))]
+    assert torch.equal(*paths)
+    assert paths[0].shape == (1, 2, 3)
+
+
+@pytest.mark.parametrize(
+    ("ask", "says"),
+    [
+        (lambda scene: scene.render(scene.cameras[0]), "time: expected a number in [0, 1], but got None"),
+        (
+            lambda scene: scene.render(np.eye(3), 0),
+            "camera_to_world: expected finite numbers (4, 4), but got (3, 3)",
+        ),
+        (
+            lambda scene: scene.render(np.diag([2, 2, 2, 1]), 0),
+            "a 3x3 of determinant 8 above [0.0, 0.0, 0.0, 1.0]",
+        ),
+        (lambda scene: scene.render(np.diag([1, -1, 1, 1]), 0), "a 3x3 of determinant -1 above"),
+        (lambda scene: scene.render("front", 0), "but got str 'front'"),
+        (lambda scene: scene.render(scene.cameras[0], 0, "pink"), "expected white, black or three numbers"),
+        (lambda scene: scene.render(scene.cameras[0], 0, [1, 2]), "background: expected finite numbers (3,)"),
+        (
+            lambda scene: scene.trajectories([0, 0, 0], [0]),
+            "points: expected finite numbers (N, 3), but got (3,)",
+        ),
+        (lambda scene: scene.trajectories([[0, 0, np.nan]], [0]), "points: expected finite numbers (N, 3)"),
+        (lambda scene: scene.frames("tests"), "split: expected one of train, val, test, held"),
+    ],
+)
+def test_what_cannot_be_asked_is_refused_in_a_line(fitted, ask, says):
+    with pytest.raises(ValueError, match=re.escape(says)):
+        ask(load(fitted))
+
+
+def test_what_a_prompt_shows_is_short(fitted):
+    scene = load(fitted)
+    frame, data = scene.frames("test")[0], opened(scene.config)[0].datamodule
+    shown = [
+        scene,
+        scene.scene,
+        frame,
+        frame.camera,
+        scene.matter(),
+        scene.render(frame),
+        scene.method.at(Moment(0.5)),
+    ]
+    shown += [
+        frame.camera.rays(),
+        View(frame.camera),
+        scene.scene.truth,
+        data.targets("test")[0],
+        data.batches.draw(),
+    ]
+    texts = [repr(thing) for thing in shown]
+    assert [text for text in texts if len(text) > 300 or "\n" in text or "tensor(" in text] == []
+
+
+def test_the_door_offers_names_without_loading_torch():
+    names = "forewarp.__version__, forewarp.Camera, forewarp.look_at, forewarp.orbit"
+    quick = "import sys, forewarp; assert forewarp.load; assert 'torch' not in sys.modules"
+    subprocess.run([sys.executable, "-c", f"{quick}; print({names})"], check=True, capture_output=True)
+    assert {"Camera", "__version__", "load", "look_at", "orbit"} == set(dir(forewarp))
+    with pytest.raises(AttributeError, match="module 'forewarp' has no attribute 'lod'"):
+        _ = forewarp.lod
 
 
 SMALL = [

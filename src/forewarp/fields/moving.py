@@ -24,6 +24,7 @@ from forewarp.ops.gaussians import (
     rotations,
 )
 from forewarp.ops.nodes import carry_nodes
+from forewarp.scene.brief import brief
 from forewarp.scene.camera import Camera
 from forewarp.scene.cloud import Cloud, Ellipsoids, nearest
 from forewarp.scene.view import Moment, Rendering, View
@@ -120,6 +121,8 @@ class GaussiansSnapshot:
     opacity_basis: Tensor
     blur: float
 
+    __repr__ = brief
+
     def render(self, view: View, background: Tensor, rendering: str | None = None) -> Rendering:
         """Render ``view`` over ``background`` (3,). Pixels and crops are taken from the whole image, which
         costs little.
@@ -193,6 +196,8 @@ class NodeMotion:
     times: Sequence[float] = ()
     offsets: Sequence[float] = ()
 
+    __repr__ = brief
+
     def motion_time(self, time: float) -> float:
         """Return the time of the motion that an image of a given time shows."""
         if not self.times:
@@ -240,6 +245,8 @@ class MovingGaussians:
     canonical_time: float
     blur: float
     motion: NodeMotion | None
+
+    __repr__ = brief
 
     to = _to
 

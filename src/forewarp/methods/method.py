@@ -77,6 +77,10 @@ class Snapshot:
     moment: Moment
     renderings: Sequence[str] = ("rendered",)
 
+    def __repr__(self) -> str:
+        """Name it and its time; a dataclass of tensors says no more with ``repr=False``."""
+        return f"{type(self).__name__}(time={self.moment.time:g})"
+
     def render(self, view: View, background: Tensor, rendering: str | None = None) -> Rendering:
         """Render ``view`` over ``background`` (3,) or (R, 3); by default the best rendering."""
         raise NotImplementedError

@@ -247,7 +247,7 @@ class NeuralVolumes(RayMethod):
         return those_that_hold(kept)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class VolumesSnapshot(RaySnapshot):
     """Such a method at one moment. An image costs decoding once, and its rays' steps."""
 

@@ -105,7 +105,7 @@ class RayMethod(Method):
         return RaySnapshot(moment, self)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class RaySnapshot(Snapshot):
     """Such a method at one moment. An image costs the same at every time: all its samples."""
 

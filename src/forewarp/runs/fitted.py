@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import sys
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import fmean
 from typing import ClassVar
@@ -18,7 +18,7 @@ from hydra.utils import get_class
 from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
-from forewarp.data.batches import color_of
+from forewarp.data.batches import COLORS, color_of
 from forewarp.data.checks import blind_frames, bounds
 from forewarp.evaluation.evaluate import evaluate, mean_scores, show
 from forewarp.fields.moving import GaussiansSnapshot, MovingGaussians
@@ -32,14 +32,15 @@ from forewarp.runs.build import build_run
 from forewarp.runs.config import saved_config, trust_of
 from forewarp.runs.overrides import key_of, typed_overrides
 from forewarp.runs.session import warn_if_changed
-from forewarp.scene.camera import Camera
+from forewarp.scene.camera import Camera, Vector, focus_point, mean_up, tensor_of
 from forewarp.scene.cloud import Cloud
 from forewarp.scene.frame import Frame, Scene, spread
-from forewarp.scene.view import Moment, View
+from forewarp.scene.view import Moment, Rendering, View
 from forewarp.training.module import DynamicSceneModule
 from forewarp.training.stages import Run
 
 SPLITS = ("train", "val", "test", "held")
+_ROUGH = 1e-3  # by which a pose's axes may miss unit length and right angles
 
 
 class Renderable:
@@ -49,43 +50,79 @@ class Renderable:
         method: renders and moves points.
         name: of the method, for errors.
         place: the folder or file that it was opened from.
+        cameras: of images that it was fitted to.
+        background: (3,), the colour behind the images that it is measured on.
     """
 
     method: Method | MovingGaussians
     name: str
     place: Path
+    cameras: Sequence[Camera]
+    background: Tensor
     _snapshot: Snapshot | GaussiansSnapshot | None = None
 
     def __repr__(self) -> str:
         """Say in a line what it is and where it came from."""
         return f"{type(self).__name__}({self.place}, {self.name})"
 
-    def render(self, camera: Camera, time: float, background: str | Tensor = "white") -> Tensor:
-        """Render the scene from a camera at a time: a picture (H, W, 3) in [0, 1], on the CPU.
+    @property
+    def focus(self) -> Tensor:
+        """The point (3,) that the cameras look at, world units, to turn round: ``forewarp.orbit``."""
+        return focus_point(self.cameras)
+
+    @property
+    def up(self) -> Tensor:
+        """The direction (3,) that is upwards in the cameras' images."""
+        return mean_up(self.cameras)
+
+    def render(
+        self,
+        view: Frame | Camera | Vector,
+        time: float | None = None,
+        background: str | Vector | None = None,
+    ) -> Rendering:
+        """Render the scene.
 
         Args:
-            camera: ``frame.camera``, or one of your own; ``camera.resized(w, h)`` changes the size.
-            time: time in [0, 1].
-            background: white, black, or a colour (3,) in [0, 1].
+            view: a frame, as it is measured; a camera, ``frame.camera`` or one of your own, of the size
+                that ``camera.resized(w, h)`` gives it; or a pose ``camera_to_world`` (4, 4), axes as
+                OpenCV's, of a camera that is else the first of ``cameras``.
+            time: in [0, 1]; None: the frame's.
+            background: white, black, or a colour (3,) in [0, 1]; None: ``background`` of the scene.
 
-        Cost: consecutive pictures of one time share one snapshot.
+        Returns:
+            images on the CPU: ``rgb`` (H, W, 3) in [0, 1], ``depth`` along the rays in world units (H, W), 0
+            where there is nothing, and ``opacity`` (H, W).
+
+        Raises:
+            ValueError: for a view without a time, or what is none of these.
+
+        Cost: consecutive images of one time share one snapshot.
         """
-        if not 0 <= time <= 1:
+        frame = view if isinstance(view, Frame) else None
+        camera = view if frame is None else frame.camera
+        if not isinstance(camera, Camera):
+            camera = replace(self.cameras[0], camera_to_world=_rigid(camera))
+        time = frame.time if time is None and frame is not None else time
+        if time is None or not 0 <= time <= 1:
             raise ValueError(f"time: expected a number in [0, 1], but got {time}")
-        behind = color_of(background) if isinstance(background, str) else background
-        moment = Moment(float(time))
+        behind = self.background if background is None else _color(background)
+        moment = Moment(float(time), camera=None if frame is None else frame.camera_id)
         with torch.no_grad():
             if self._snapshot is None or not self._snapshot.holds(moment):
                 self._snapshot = self.method.at(moment)
             drawn = self._snapshot.render(View(camera), behind.to(self.method.device))
-        return drawn.rgb.clamp(0, 1).reshape(camera.height, camera.width, 3).cpu()
+        return drawn.shaped(camera.height, camera.width)
 
-    def trajectories(self, points: Tensor, times: Sequence[float]) -> Tensor:
-        """Follow canonical points (N, 3), world units, to ``times`` (T,) in [0, 1]; return (N, T, 3)."""
+    def trajectories(self, points: Vector, times: Vector) -> Tensor:
+        """Follow canonical points (N, 3), world units, to ``times`` (T,) in [0, 1]; return (N, T, 3) float32.
+
+        Tensors, arrays and lists will do.
+        """
         method = self._able(HasTrajectories, "follows points")
+        points, times = tensor_of("points", points, None, 3), tensor_of("times", times, None)
         with torch.no_grad():
-            at = torch.as_tensor(times, dtype=torch.float32, device=method.device)
-            return method.trajectories(points.to(method.device), at).cpu()
+            return method.trajectories(*(given.float().to(method.device) for given in (points, times))).cpu()
 
     def matter(self) -> Cloud:
         """Return the canonical matter as points with colour and opacity."""
@@ -98,6 +135,27 @@ class Renderable:
         return self.method
 
 
+def _rigid(given: Vector) -> Tensor:
+    """Make a pose (4, 4) of what a user gives; refuse what is none."""
+    pose = tensor_of("camera_to_world", given, 4, 4)
+    turn, last = pose[:3, :3], pose[3].tolist()
+    error, volume = float((turn.T @ turn - torch.eye(3)).abs().max()), float(torch.linalg.det(turn))
+    if error > _ROUGH or volume < 0 or last != [0, 0, 0, 1]:
+        expected = "a rotation (no scale, no mirror) and a place, above 0 0 0 1"
+        got = f"a 3x3 of determinant {volume:.4g} above {last}; forewarp.look_at makes poses"
+        raise ValueError(f"camera_to_world: expected {expected}, but got {got}")
+    return pose
+
+
+def _color(given: str | Vector) -> Tensor:
+    """Make a colour (3,) of what a user gives; refuse what is none."""
+    if not isinstance(given, str):
+        return tensor_of("background", given, 3).float()
+    if given not in COLORS:
+        raise ValueError(f"background: expected {', '.join(COLORS)} or three numbers, but got '{given}'")
+    return color_of(given)
+
+
 @dataclass(repr=False)
 class Fitted(Renderable):
     """A fitted scene, as ``forewarp.load(folder)`` returns it.
@@ -107,9 +165,11 @@ class Fitted(Renderable):
     >>> scene
     Fitted(..., forward)
     >>> frame = scene.frames("test")[0]
-    >>> picture = scene.render(frame.camera, frame.time)
-    >>> picture.shape == (frame.camera.height, frame.camera.width, 3)
-    True
+    >>> scene.render(frame)
+    Rendering(rgb=float32 (32, 32, 3), depth=float32 (32, 32), opacity=float32 (32, 32))
+    >>> pose = forewarp.look_at([3, 0, 2], scene.focus, scene.up)
+    >>> scene.render(pose, 0.5, background="black").rgb.shape
+    torch.Size([32, 32, 3])
     >>> points = scene.matter().points[:5]
     >>> scene.trajectories(points, [0.0, 0.5, 1.0]).shape
     torch.Size([5, 3, 3])
@@ -120,13 +180,15 @@ class Fitted(Renderable):
         folder: the run's folder.
         config: the run's config.
         module: the fitted module; ``module.method`` is the method.
-        scene: cameras, times, box.
+        scene: frames, box, canonical time.
+        background: (3,), the colour behind the images that it is measured on.
     """
 
     folder: Path
     config: DictConfig
     module: DynamicSceneModule
     scene: Scene
+    background: Tensor
 
     @property
     def place(self) -> Path:
@@ -142,6 +204,11 @@ class Fitted(Renderable):
     def name(self) -> str:
         """The method's name in the config."""
         return self.config.model.name
+
+    @property
+    def cameras(self) -> list[Camera]:
+        """The cameras of the training images, in order."""
+        return [frame.camera for frame in self.scene.train]
 
     @property
     def metrics(self) -> dict:
@@ -218,7 +285,8 @@ def open_run(run: str | Path, *, trust: Sequence[str] | str = (), device: str = 
         return open_file(Path(run), device)
     config = saved_config(str(run), OmegaConf.create({"trust": list(trust_of(trust))}))
     made, module = opened(config, device)
-    return Fitted(Path(run), config, module, made.datamodule.scene)
+    data = made.datamodule
+    return Fitted(Path(run), config, module, data.scene, data.targets("test").background)
 
 
 def measure_run(run: Run, module: DynamicSceneModule, config: DictConfig) -> dict:

@@ -8,6 +8,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from forewarp.scene.brief import brief
+
 
 @dataclass(frozen=True)
 class Box:
@@ -22,6 +24,8 @@ class Box:
 
     low: tuple[float, float, float]
     high: tuple[float, float, float]
+
+    __repr__ = brief
 
     def __post_init__(self) -> None:
         for name in ("low", "high"):

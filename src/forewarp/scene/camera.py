@@ -9,13 +9,43 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from forewarp.ops.lens import distort, undistort, unfolded
+from forewarp.scene.brief import brief
 
 # In the plane at distance 1: outside every image, but small enough for 64-bit integers in pixels.
 _OUTSIDE, _ON_AXIS = 1e9, 1e-9
+
+Vector = Tensor | np.ndarray | Sequence[float]
+
+
+def tensor_of(key: str, given, *shape: int | None) -> Tensor:
+    """Make a float64 tensor of what a user gives as a tensor, an array, or a list.
+
+    Args:
+        key: what it is, for the error.
+        given: numbers.
+        shape: that it must have; None: any length.
+
+    Raises:
+        ValueError: for another shape, or what is not finite numbers.
+
+    >>> tensor_of("points", [[1, 2, 3]], None, 3).shape
+    torch.Size([1, 3])
+    """
+    try:
+        made = given if isinstance(given, Tensor) else torch.from_numpy(np.array(given, np.float64))
+    except (TypeError, ValueError):
+        made = None
+    fits = made is not None and [n if n is None else k for n, k in zip(shape, made.shape)] == [*shape]
+    if not fits or made.ndim != len(shape) or not bool(made.isfinite().all()):
+        form = f"({', '.join('N' if n is None else str(n) for n in shape)}{',' * (len(shape) == 1)})"
+        got = f"{type(given).__name__} {given!r}" if made is None else f"{tuple(made.shape)}"
+        raise ValueError(f"{key}: expected finite numbers {form}, but got {got}")
+    return made.double()
 
 
 @dataclass(frozen=True)
@@ -67,6 +97,8 @@ class Rays:
     near: float
     far: float
 
+    __repr__ = brief
+
     def __len__(self) -> int:
         return len(self.origins)
 
@@ -87,7 +119,8 @@ def joined(parts: Sequence[Rays]) -> Rays:
 @dataclass(frozen=True)
 class Camera:
     """``width`` x ``height`` pixels, focal lengths ``fx fy`` and principal point ``cx cy`` in pixels,
-    ``camera_to_world`` (4, 4) float64 tensor, ``near`` and ``far`` along the unit ray in world units.
+    ``camera_to_world`` (4, 4) float64 tensor (arrays and lists become one), ``near`` and ``far`` along the
+    unit ray in world units.
 
     The plane's point (x, y), bent by the ``lens``, lies at pixel ``u = fx x + skew y + cx, v = fy y + cy``.
     """
@@ -103,6 +136,16 @@ class Camera:
     far: float
     skew: float = 0.0
     lens: Lens | None = None
+
+    def __post_init__(self) -> None:
+        pose = tensor_of("camera_to_world", self.camera_to_world, 4, 4)
+        object.__setattr__(self, "camera_to_world", pose)
+
+    def __repr__(self) -> str:
+        """Say in a line how large it is and where it stands."""
+        place = ", ".join(f"{x:.4g}" for x in self.center.tolist())
+        lens = ", with a lens" if self.lens is not None else ""
+        return f"Camera({self.width} x {self.height}, fx={self.fx:.4g}, fy={self.fy:.4g}, at [{place}]{lens})"
 
     @property
     def center(self) -> Tensor:
@@ -159,19 +202,23 @@ class Camera:
         return replace(self, width=width, height=height, **pixels, skew=self.skew * sx)
 
 
-def look_at(center: Tensor, target: Tensor, up: Tensor) -> Tensor:
+def look_at(center: Vector, target: Vector, up: Vector) -> Tensor:
     """Make the pose (4, 4) of a camera at ``center`` that looks at ``target``, with ``up`` upwards.
 
-    All are (3,). A camera that looks along ``up`` gets any horizontal axis.
+    All are (3,): tensors, arrays, lists. A camera that looks along ``up`` gets any horizontal axis.
+
+    >>> look_at([0, -4, 0], [0, 0, 0], up=[0, 0, 1])[:3, 2].tolist()  # which way it looks
+    [0.0, 1.0, 0.0]
     """
-    forward = torch.nn.functional.normalize(target.double() - center.double(), dim=0)
-    right = torch.linalg.cross(forward, up.double())
+    center, target, up = (tensor_of(*v, 3) for v in (("center", center), ("target", target), ("up", up)))
+    forward = torch.nn.functional.normalize(target - center, dim=0)
+    right = torch.linalg.cross(forward, up)
     if right.norm() < 1e-6:
         right = torch.linalg.cross(forward, torch.eye(3, dtype=torch.float64)[int(forward.abs().argmin())])
     right = torch.nn.functional.normalize(right, dim=0)
     pose = torch.eye(4, dtype=torch.float64)
     pose[:3, :3] = torch.stack([right, torch.linalg.cross(forward, right), forward], -1)
-    pose[:3, 3] = center.double()
+    pose[:3, 3] = center
     return pose
 
 
@@ -232,7 +279,7 @@ class RandomPatches:
         return camera.rays((at[..., 0] * camera.width + at[..., 1]).reshape(-1))
 
 
-def orbit(camera: Camera, focus: Tensor, up: Tensor, turns: Tensor) -> list[Camera]:
+def orbit(camera: Camera, focus: Vector, up: Vector, turns: Vector) -> list[Camera]:
     """Make cameras that circle ``focus`` about ``up`` at the height and distance of ``camera``.
 
     A camera at the focus keeps its pose.
@@ -242,10 +289,11 @@ def orbit(camera: Camera, focus: Tensor, up: Tensor, turns: Tensor) -> list[Came
         focus, up: (3,).
         turns: (N,) fractions of a full turn from the start.
     """
+    focus, up = tensor_of("focus", focus, 3), torch.nn.functional.normalize(tensor_of("up", up, 3), dim=0)
     offset = camera.center.double() - focus
     height = (offset @ up) * up
     a, b = offset - height, torch.linalg.cross(up, offset - height)
-    angles = [2 * math.pi * turn for turn in turns.tolist()]
+    angles = [2 * math.pi * turn for turn in tensor_of("turns", turns, None).tolist()]
     centers = [focus + height + math.cos(angle) * a + math.sin(angle) * b for angle in angles]
     return [_moved(camera, center, focus, up) for center in centers]
 

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from forewarp.ops.gaussians import FLAT, harmonics
 from forewarp.scene.box import Box
+from forewarp.scene.brief import brief
 
 _THINNEST = 1e-6  # of a Gaussian's longest axis: a map may have pressed it flat, and logarithms are taken
 
@@ -26,6 +27,8 @@ class Cloud:
     colors: Tensor
     opacity: Tensor
     size: float
+
+    __repr__ = brief
 
     def __len__(self) -> int:
         return len(self.points)
@@ -94,6 +97,8 @@ class Handover:
     paths: Tensor | None = None
     notes: Mapping[str, float] = field(default_factory=dict)
 
+    __repr__ = brief
+
 
 @dataclass(frozen=True)
 class Ellipsoids:
@@ -111,6 +116,8 @@ class Ellipsoids:
     roots: Tensor
     opacity: Tensor
     harmonics: Tensor
+
+    __repr__ = brief
 
     def __len__(self) -> int:
         return len(self.centers)

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from forewarp.ops.grid import dilate
 from forewarp.scene.box import Box, Lattice
+from forewarp.scene.brief import brief
 from forewarp.scene.camera import Camera
 
 
@@ -37,6 +38,8 @@ class Frame:
     load_valid: Callable[[], Tensor] | None = None
     load_moving: Callable[[], Tensor] | None = None
 
+    __repr__ = brief
+
 
 @dataclass(frozen=True)
 class Truth:
@@ -47,6 +50,8 @@ class Truth:
 
     points: Tensor
     times: Tensor
+
+    __repr__ = brief
 
 
 @dataclass(frozen=True)
@@ -69,6 +74,8 @@ class Scene:
     protocol: dict = field(default_factory=dict)
     still: Tensor | None = None
     held: tuple[Frame, ...] = ()
+
+    __repr__ = brief
 
     @property
     def times(self) -> tuple[float, ...]:

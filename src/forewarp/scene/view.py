@@ -10,6 +10,7 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
+from forewarp.scene.brief import brief
 from forewarp.scene.camera import Camera, Rays, joined
 from forewarp.scene.frame import Frame
 
@@ -24,6 +25,8 @@ class Moment:
     frame: int | None = None
     camera: int | None = None
 
+    __repr__ = brief
+
 
 @dataclass(frozen=True)
 class View:
@@ -34,6 +37,8 @@ class View:
     camera: Camera
     pixels: Tensor | None = None
     crop: tuple[int, int, int, int] | None = None
+
+    __repr__ = brief
 
     def __len__(self) -> int:
         return math.prod(self.shape)
@@ -66,12 +71,22 @@ class View:
 @dataclass(frozen=True)
 class Rendering:
     """A rendered view, one row per pixel: ``rgb`` (R, 3) over the background; ``depth`` (R,), the mean
-    distance along the ray in world units, 0 if the ray hits nothing; ``opacity`` (R,) in [0, 1].
+    distance along the ray in world units, 0 if the ray hits nothing; ``opacity`` (R,) in [0, 1]. As images
+    (``shaped``) R is H, W.
     """
 
     rgb: Tensor
     depth: Tensor
     opacity: Tensor
+
+    __repr__ = brief
+
+    def shaped(self, height: int, width: int) -> Rendering:
+        """Make images of all pixels, on the CPU: ``rgb`` (H, W, 3), clipped to [0, 1], ``depth`` and
+        ``opacity`` (H, W).
+        """
+        rgb, *others = self.rgb.clamp(0, 1), self.depth, self.opacity
+        return Rendering(*(part.reshape(height, width, *part.shape[1:]).cpu() for part in (rgb, *others)))
 
     @staticmethod
     def joined(parts: Sequence[Rendering]) -> Rendering:
@@ -117,6 +132,8 @@ class Observation:
     background: Tensor
     valid: Tensor | None = None
 
+    __repr__ = brief
+
     def to(self, device) -> Observation:
         """Move the colours to another device; the view stays on the CPU."""
         valid = None if self.valid is None else self.valid.to(device)
@@ -135,6 +152,8 @@ class Batch:
     observations: tuple[Observation, ...]
     frame: int
     instant: tuple[Observation, ...] = ()
+
+    __repr__ = brief
 
     @property
     def time(self) -> float:
@@ -183,6 +202,8 @@ class Target:
     index: int | None = None
     valid: Tensor | None = None
     moving: Tensor | None = None
+
+    __repr__ = brief
 
     @property
     def moment(self) -> Moment:

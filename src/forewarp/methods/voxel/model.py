@@ -39,7 +39,7 @@ _MARGIN = 2.0  # voxels around all matter that the next stage's box leaves
 Factory = Callable[..., nn.Module]  # makes a part once the lattices are known
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class VoxelSnapshot(Snapshot):
     """Everything a voxel method computed at one time; None for what it does not have.
 
