@@ -34,23 +34,25 @@ def test_each_decibel_names_the_first_to_reach_it_in_all_seeds(tmp_path):
     assert rows_of(text, "26")[0][1:3] == rows_of(text, "27")[0][1:3] == ["35.0", "good"]
     assert rows_of(text, "28") == []
     assert "seconds to 25 dB" in text  # what the base reaches
-    assert rows_of(text, "base")[0][1:] == ["1.0", "2", "25.0 ± 7.1", "25.50 ± 0.00", "", "100 ± 0"]
+    assert rows_of(text, "base")[0][1:] == ["1", "2", "25.0 ± 7.1", "25.50 ± 0.00", "", "100 ± 0"]
     csv = table.read_text().splitlines()
     assert csv[0].startswith("variant,minutes,seeds,seconds to 25 dB,seconds to 25 dB sd,PSNR")
     assert (len(csv), picture.name) == (4, "accuracy-time-ball.png")
 
 
 def test_a_target_of_ones_own_and_what_has_no_curve(tmp_path):
-    write_run(tmp_path / "runs", epe=0.25)
+    about = {"protocol": {"dataset": "dnerf", "device": "a cpu", "threads": 2, "versions": {"torch": "2"}}}
+    write_run(tmp_path / "runs", epe=0.25, minutes=0.05, metrics=about)
     write_run(tmp_path / "runs", "failed", curve=None)
     write_run(tmp_path / "runs", "killed", psnr=None)
-    other = Published("other", 100.0, 32.0, "a GPU", "its paper", "dnerf")
-    page = write_accuracy_time(tmp_path / "runs", tmp_path, target=20.0, published=[other])[0].read_text()
-    assert rows_of(page, "base")[0][3:6] == ["10.0", "25.50", "0.2500"]
+    others = [Published(name, 100.0, 32.0, "a GPU", "its paper", name) for name in ("dnerf", "hypernerf")]
+    page = write_accuracy_time(tmp_path / "runs", tmp_path, target=20.0, published=others)[0].read_text()
+    assert rows_of(page, "base")[0][1:6] == ["0.05", "1", "10.0", "25.50", "0.2500"]
     assert "* ball/failed-1.0-seed0: no accuracy_time.csv; run its command with data.held_out=8" in page
     assert "* ball/killed-1.0-seed0: no metrics.json; run its command again" in page
     assert not rows_of(page, "killed")
-    assert "* other: 32 dB, 100 s, a GPU; its paper" in page
+    assert "* dnerf: 32 dB, 100 s, a GPU; its paper" in page
+    assert "* hypernerf" not in page  # whose means say nothing of this scene
 
 
 def test_changes_are_against_the_same_seed(tmp_path):

@@ -174,12 +174,25 @@ def test_pages_tell_how_numbers_came_about(whole):
     assert not re.search(r"https?://|<script|<link", page)
     assert "<b>30.00</b>" in page or "<u>30.00</u>" in page or "<td class=n>30.00" in page
     latex = (whole / "paper.tex").read_text()
-    assert latex_text("a_b & 5 %^2") == r"a\_b \& 5 \%\textasciicircum{}2"
+    assert (
+        latex_text("2026-11-25, a_b^c: -2.5 & $±")
+        == r"2026-11-25, a\_b\textasciicircum{}c: $-$2.5 \& \$$\pm$"
+    )
+    assert r"Ours (80$^{3}$) & published" in latex
+    assert "textasciicircum" not in latex
+    assert r"\caption{D-NeRF, mean of eight scenes (table 1 of the paper)}" in latex
     for name in ("table", "tabular", "document"):
         assert latex.count(rf"\begin{{{name}}}") == latex.count(rf"\end{{{name}}}") > 0
-    assert r"\resizebox{\textwidth}{!}{%" in latex
     assert r"\underline{" in latex or r"\textbf{" in latex
     assert r"\footnotesize machine: a cpu, 2 threads, torch 2" in latex
+
+
+def test_a_new_folder_takes_pictures_alone(tmp_path):
+    (tmp_path / "curves").mkdir()
+    iio.imwrite(tmp_path / "curves" / "accuracy-time-hook.png", np.zeros((2, 2, 3), np.uint8))
+    paper_run(tmp_path / "runs", "toy", dataset="mine")  # of no table
+    write_paper(tmp_path / "runs", tmp_path / "new" / "out", curves=tmp_path / "curves")
+    assert "](accuracy-time-hook.png)" in (tmp_path / "new" / "out" / "paper.md").read_text()
 
 
 def test_without_matplotlib_the_page_says_why_it_has_no_figure(tmp_path, monkeypatch):
@@ -207,11 +220,18 @@ def test_counterparts_never_meet_printed_numbers(tmp_path):
     runs, _ = read_runs(tmp_path)
     made = stand_in(read_paper(PAPER)["dnerf"], runs)
     names = [column.name for column in made.columns]
-    assert names[1:4] == [f"vehicle {m}" for m in ("PSNR↑", "SSIM↑", "LPIPS↓")]
+    assert names[1:4] == ["vehicle PSNR↑", "vehicle SSIM↑", "training, s a run"]  # nothing has LPIPS
     assert names[-2:] == ["published as", "published: Mean of 8 PSNR"]
     assert made.texts()[0][1] == "28.00"
     assert made.rows[0][-2:] == ["Ours (80^3)", "32.68"]
     assert stand_in(read_paper(PAPER)["dnerf_scenes"], runs) is None
+    paper_run(tmp_path / "two", "vehicle", "full", made=True)
+    paper_run(tmp_path / "two", "rig", "no_tv", dataset="hypernerf", made=True)
+    both = stand_in(read_paper(PAPER)["modules"], read_runs(tmp_path / "two")[0])
+    assert [row[-3:] for row in both.rows] == [
+        ["Ours", "32.68", ""],
+        ["Ours, no total variation", "", "23.84"],
+    ]
     write_paper(tmp_path, tmp_path / "out")
     text = (tmp_path / "out" / "paper.md").read_text()
     (table,) = text.split("## Table 1: D-NeRF, mean of eight scenes")[1:]

@@ -81,7 +81,9 @@ def write_accuracy_time(
         replace_file(file, every.csv())
         scenes.append({"name": scene, "picture": picture.name, "tables": [cheapest(groups), every]})
         written += [picture, file]
-    about = {"machine": runs.machines(), "published": published, "left_out": left_out}
+    datasets = {row["dataset"] for row in runs}
+    shown = [other for other in published if other.dataset in datasets]
+    about = {"machine": runs.machines(), "published": shown, "left_out": left_out}
     replace_file(out / "accuracy-time.md", rendered("accuracy_time.md.j2", scenes=scenes, **about))
     return [out / "accuracy-time.md", *written]
 
@@ -107,7 +109,7 @@ def cheapest(groups: Mapping[tuple, Runs]) -> Table:
 
 def variants(groups: Mapping[tuple, Runs], target: float) -> Table:
     """List for every variant the seconds to the target PSNR and the final numbers."""
-    columns = {"variant": "variant", "minutes": Column("minutes", 1), "seeds": Column("seeds", 0)}
+    columns = {"variant": "variant", "minutes": Column("minutes", None), "seeds": Column("seeds", 0)}
     columns |= {
         "reached": Column(f"seconds to {target:g} dB", 1),
         "psnr": "PSNR at the end",
@@ -222,7 +224,7 @@ def write_effects(folder: Path, out: Path) -> list[Path]:
             "scene": "scene",
             "ablation": "choice",
             "seed": Column("seed", 0),
-            "minutes": Column("minutes", 1),
+            "minutes": Column("minutes", None),
         }
         columns |= {
             "psnr": Column("PSNR", 3),

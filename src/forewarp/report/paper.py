@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import math
 import re
-import shutil
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
@@ -219,7 +218,8 @@ def comparison(table: PaperTable, runs: Runs, numbers: Mapping[str, int] | None 
 
 
 def stand_in(table: PaperTable, runs: Runs, numbers: Mapping[str, int] | None = None) -> Table | None:
-    """Make a table of the runs on synthetic counterparts, with what was published for real scenes at its end.
+    """Make a table of the runs on synthetic counterparts, with what was published for the same dataset's real
+    scenes at its end.
 
     None if there are no such runs; ``numbers`` as of ``comparison``.
     """
@@ -234,13 +234,13 @@ def stand_in(table: PaperTable, runs: Runs, numbers: Mapping[str, int] | None = 
     ]
     lines = []
     for of_row in found:
-        printed = table.printed(of_row[0])
-        values = [printed.values[i] for i, _ in shown] if printed else [""] * len(shown)
+        printed, own = table.printed(of_row[0]), {dataset_of(run) for run in of_row}
+        values = [printed.values[i] if printed and group.dataset in own else "" for i, group in shown]
         beside = [printed.name if printed else "", *values]
         lines.append([name_of(of_row), *cells_of(of_row, made), *costs_of(of_row, numbers), *beside])
     columns = ["measured", *(_column(*column) for column in made.columns), *COSTS, "published as"]
     columns += [f"published: {group.name} PSNR" for _, group in shown]
-    return Table(columns, lines, marks=_marks(found, made, lines, 1))
+    return Table(columns, lines, marks=_marks(found, made, lines, 1)).filled()
 
 
 def counterpart(table: PaperTable, runs: Runs) -> PaperTable | None:
@@ -425,7 +425,7 @@ def _figures(runs: Runs, out: Path, curves: Path | None) -> list[Section]:
         return [Section("Figures", facts=[str(error)])]
     for path in sorted(curves.glob("accuracy-time-*.png")) if curves is not None else ():
         if path.parent.resolve() != out.resolve():
-            shutil.copyfile(path, out / path.name)
+            replace_file(out / path.name, path.read_bytes())
     if drawn := sorted(out.glob("accuracy-time-*.png")):
         lines = ["separate runs, with views held out: forewarp-report kind=accuracy_time"]
         sections.append(Section("Accuracy against training time", facts=lines, pictures=drawn))

@@ -7,7 +7,7 @@ import csv
 import io
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
 
@@ -29,6 +29,9 @@ _LATEX = {c: "\\" + c for c in "&%$#_{}"}
 _LATEX |= {"²": "$^2$", "\\": r"\textbackslash{}", "^": r"\textasciicircum{}"}
 _LATEX |= {"±": r"$\pm$", "δ": r"$\delta$", "<": "$<$", ">": "$>$", "↑": r"$\uparrow$", "↓": r"$\downarrow$"}
 _LATEX |= {"~": r"\textasciitilde{}", "×": r"$\times$"}
+_POWER = re.compile(r"\\textasciicircum\{\}(\d+)")
+_MINUS = re.compile(r"(?<![\w.])-(?=\d)")  # of a number, not of a date or a range
+_BETWEEN = re.compile(r"(?<!\\)\$\$")  # one formula ends where the next begins
 
 
 class Difference(float):
@@ -40,10 +43,14 @@ Cell = Estimate | float | int | str | None
 
 @dataclass(frozen=True)
 class Column:
-    """A column's title and number format; ``prefix`` stands before numbers, ``spread``: show deviations."""
+    """A column's title and number format.
+
+    ``digits`` after the point, None: as many as a number has, at most four that count; ``prefix`` stands
+    before numbers; ``spread``: show deviations.
+    """
 
     name: str
-    digits: int = 2
+    digits: int | None = 2
     signed: bool = False
     prefix: str = ""
     spread: bool = True
@@ -53,6 +60,8 @@ class Column:
 
         >>> Column("PSNR", signed=True).text(Estimate(0.5, 0.1))
         '+0.50 ± 0.10'
+        >>> [Column("minutes", None).text(minutes) for minutes in (0.05, 1.0, 20.0)]
+        ['0.05', '1', '20']
         """
         if value is None or isinstance(value, str):
             return value or ""
@@ -60,7 +69,8 @@ class Column:
             with_spread = self.spread and value.deviation is not None
             return self.text(value.mean) + (f" ± {value.deviation:.{self.digits}f}" if with_spread else "")
         sign = "+" if self.signed or isinstance(value, Difference) else ""
-        return f"{self.prefix}{value:{sign}.{self.digits}f}"
+        form = ".4g" if self.digits is None else f".{self.digits}f"
+        return f"{self.prefix}{value:{sign}{form}}"
 
 
 @dataclass(frozen=True)
@@ -89,6 +99,13 @@ class Table:
     def of(cls, rows: Iterable[Mapping], columns: Mapping[str, Column | str], caption: str = "") -> Table:
         """Select columns of rows, by name; None is empty."""
         return cls([*columns.values()], [[row.get(name) for name in columns] for row in rows], caption)
+
+    def filled(self) -> Table:
+        """Leave out the columns in which no row has anything."""
+        kept = [j for j in range(len(self.columns)) if any(row[j] not in (None, "") for row in self.rows)]
+        rows = [[row[j] for j in kept] for row in self.rows]
+        marks = {(i, kept.index(j)): mark for (i, j), mark in self.marks.items()}
+        return replace(self, columns=[self.columns[j] for j in kept], rows=rows, marks=marks)
 
     def __str__(self) -> str:
         """Return the table for a Markdown page, numbers aligned to the right."""
@@ -184,9 +201,10 @@ def _environment() -> Environment:
 
 
 def latex_text(text: str) -> str:
-    """Escape text for LaTeX.
+    """Escape text for LaTeX; powers, and the minus of numbers, are formulas.
 
-    >>> latex_text("50 % of a_b")
-    '50 \\\\% of a\\\\_b'
+    >>> print(latex_text("50 % of a_b: δ<1.25², -0.4 (80^3)"))
+    50 \\% of a\\_b: $\\delta<$1.25$^2$, $-$0.4 (80$^{3}$)
     """
-    return "".join(_LATEX.get(c, c) for c in text)
+    escaped = _POWER.sub(r"$^{\1}$", "".join(_LATEX.get(c, c) for c in text))
+    return _BETWEEN.sub("", _MINUS.sub("$-$", escaped))
