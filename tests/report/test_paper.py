@@ -22,7 +22,7 @@ from forewarp.report.paper import (
     write_paper,
 )
 from forewarp.report.results import Runs, read_runs
-from forewarp.report.tables import latex_text
+from forewarp.report.tables import Table, latex_text
 from tests.support.configs import options
 from tests.support.runs_on_disk import rows_of, write_run
 
@@ -185,6 +185,28 @@ def test_pages_tell_how_numbers_came_about(whole):
         assert latex.count(rf"\begin{{{name}}}") == latex.count(rf"\end{{{name}}}") > 0
     assert r"\underline{" in latex or r"\textbf{" in latex
     assert r"\footnotesize machine: a cpu, 2 threads, torch 2" in latex
+
+
+def test_published_numbers_of_a_dataset_stand_beside_its_runs_alone(tmp_path):
+    paper_run(tmp_path, "hook", "no_tv")
+    table = table_of(tmp_path, "modules")
+    scores = [column.name for column in table.columns][2 : -len(COSTS)]
+    assert scores == ["D-NeRF PSNR↑", "D-NeRF LPIPS↓"]
+    assert cells(table, kind="published") == ["33.09", "0.046"]
+
+
+def test_wide_tables_are_cut_for_latex(tmp_path):
+    for scene in ALL:
+        paper_run(tmp_path, scene)
+    write_paper(tmp_path, tmp_path / "out")
+    latex = (tmp_path / "out" / "paper.tex").read_text()
+    heads = re.findall(r"\\toprule\n(.*)", latex)
+    assert [head.count("&") for head in heads] == [10, 13, 13, 13]
+    assert latex.count(r"(supplement of table 1 of the paper), part") == 3
+    assert all(head.startswith("method & kind & ") for head in heads)
+    assert r"\shortstack[r]{Hell Warrior\\PSNR$\uparrow$}" in heads[1]
+    marked = Table(["a", "x", "y", "z"], [["r", 1, 2, 3]], marks={(0, 3): "best"}).cut(2)[1]
+    assert marked.texts("md") == [["r", "**3.00**"]]
 
 
 def test_a_new_folder_takes_pictures_alone(tmp_path):

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
@@ -190,7 +190,8 @@ def costs_of(runs: Runs, numbers: Mapping[str, int]) -> list[Cell]:
 def comparison(table: PaperTable, runs: Runs, numbers: Mapping[str, int] | None = None) -> Table:
     """Make a table of each published row with the measured ones of its method below it, then the others.
 
-    After each measured row comes its difference from the published one. In each column the best and the
+    After each measured row comes its difference from the published one. Columns are of the datasets that the
+    runs are of. In each column the best and the
     second best of the measured rows are marked, if all may be compared.
 
     Args:
@@ -199,6 +200,7 @@ def comparison(table: PaperTable, runs: Runs, numbers: Mapping[str, int] | None 
         numbers: of the page's protocols, as of ``numbered``; None: those of ``runs`` alone.
     """
     found = measured(table, runs)
+    table = of_datasets(table, {dataset_of(run) for of_row in found for run in of_row})
     numbers, no_costs = numbers or numbered(runs), [None] * len(COSTS)
     lines, rules = [], []
     for printed in [*table.rows, None]:
@@ -241,6 +243,13 @@ def stand_in(table: PaperTable, runs: Runs, numbers: Mapping[str, int] | None = 
     columns = ["measured", *(_column(*column) for column in made.columns), *COSTS, "published as"]
     columns += [f"published: {group.name} PSNR" for _, group in shown]
     return Table(columns, lines, marks=_marks(found, made, lines, 1)).filled()
+
+
+def of_datasets(table: PaperTable, datasets: Collection[str]) -> PaperTable:
+    """Leave out the columns of other datasets."""
+    kept = [i for i, (group, _) in enumerate(table.columns) if group.dataset in datasets]
+    rows = [row._replace(values=tuple(row.values[i] for i in kept)) for row in table.rows]
+    return replace(table, groups=[group for group in table.groups if group.dataset in datasets], rows=rows)
 
 
 def counterpart(table: PaperTable, runs: Runs) -> PaperTable | None:
@@ -385,12 +394,13 @@ def facts(runs: Runs, numbers: Mapping[str, int]) -> list[str]:
         steps = f"{run['iterations']} steps" if run["iterations"] else ""
         budgets.add(", ".join(filter(None, (run["preset"], minutes, steps))))
     protocols = sorted((numbers[text], text) for text in runs.by("protocol"))
+    count = len({run["folder"] for run in runs})
     return [
         *(f"protocol {number}: {text}" for number, text in protocols),
         f"machine: {runs.machines()}",
         f"budget: {'; '.join(sorted(budgets))}",
         f"date: {runs.days()}",
-        f"command, one of {len({run['folder'] for run in runs})} runs: {portable(runs[0]['command'])}",
+        f"command{f', one of {count} runs' * (count > 1)}: {portable(runs[0]['command'])}",
     ]
 
 

@@ -102,10 +102,19 @@ class Table:
 
     def filled(self) -> Table:
         """Leave out the columns in which no row has anything."""
-        kept = [j for j in range(len(self.columns)) if any(row[j] not in (None, "") for row in self.rows)]
+        return self._of([j for j, column in enumerate(zip(*self.rows)) if set(column) - {None, ""}])
+
+    def _of(self, kept: Sequence[int]) -> Table:
+        """Keep some columns."""
         rows = [[row[j] for j in kept] for row in self.rows]
-        marks = {(i, kept.index(j)): mark for (i, j), mark in self.marks.items()}
+        marks = {(i, kept.index(j)): mark for (i, j), mark in self.marks.items() if j in kept}
         return replace(self, columns=[self.columns[j] for j in kept], rows=rows, marks=marks)
+
+    def cut(self, most: int) -> list[Table]:
+        """Cut into tables of ``most`` columns or fewer, each after the first ones of text."""
+        first = self.numeric.index(True) if True in self.numeric else len(self.columns)
+        pieces = [range(j, min(j + most, len(self.columns))) for j in range(first, len(self.columns), most)]
+        return [self._of([*range(first), *piece]) for piece in pieces or [range(0)]]
 
     def __str__(self) -> str:
         """Return the table for a Markdown page, numbers aligned to the right."""
@@ -194,10 +203,19 @@ def _environment() -> Environment:
     )
     environment.filters |= {
         "tex": latex_text,
+        "tex_head": _latex_head,
         "tex_rows": lambda table: table.texts("tex", latex_text),
         "inlined": lambda path: "data:image/png;base64," + base64.b64encode(path.read_bytes()).decode(),
     }
     return environment
+
+
+def _latex_head(name: str) -> str:
+    """Write a column's title for LaTeX: that of a score on two lines, as its numbers are narrow."""
+    *group, metric = name.split(" ")
+    if not group or metric[-1:] not in ("↑", "↓"):
+        return latex_text(name)
+    return f"\\shortstack[r]{{{latex_text(' '.join(group))}\\\\{latex_text(metric)}}}"
 
 
 def latex_text(text: str) -> str:
