@@ -15,6 +15,18 @@ def test_depth_is_bright_near_and_white_where_nothing_is():
     assert bool((images.depth_colors(torch.zeros(2, 3), torch.zeros(2, 3)) == 1).all())
 
 
+def test_the_scale_of_depth_tells_its_ends_in_the_corner():
+    depth = torch.linspace(2.0, 4.0, 50 * 60).reshape(50, 60)
+    colors = images.depth_colors(depth, torch.ones_like(depth))
+    assert torch.equal(colors[-14:, -48:], images.depth_scale(2.02, 3.98))
+    assert torch.equal(colors[:-14], images.depth_colors(depth, torch.ones_like(depth))[:-14])
+    scale = images.depth_scale(1.7, -4e-9)
+    texts = ["".join("#" if dark else "." for dark in line) for line in (scale[1:6, 1:12] == 0).all(-1)]
+    assert texts == [".#......###", "##........#", ".#.......#.", ".#.......#.", "###..#...#."]
+    assert (scale[9, 1] - scale[9, -2]).sum() > 0.5  # near is bright
+    assert images.depth_colors(depth[:9], torch.ones(9, 60)).min() > 0.1  # too small for one
+
+
 def test_error_is_black_where_images_agree_and_white_at_full():
     a = torch.rand(2, 3, 3, generator=torch.Generator().manual_seed(0)) * 0.5
     assert float(images.error_colors(a, a).max()) == 0

@@ -22,6 +22,10 @@ from forewarp.files import written_whole
 _DEPTH = ((0.16, 0.11, 0.33), (0.17, 0.36, 0.55), (0.16, 0.61, 0.57), (0.55, 0.80, 0.36), (0.99, 0.91, 0.45))
 _ERROR = ((0.0, 0.0, 0.0), (0.45, 0.05, 0.25), (0.90, 0.30, 0.10), (1.0, 0.78, 0.25), (1.0, 1.0, 0.9))
 _STILL = 0.88  # grey of what does not move; white is empty
+# Characters of numbers, 3 pixels wide and 5 high: the bits of a row as an octal digit.
+_GLYPHS = {"0": "75557", "1": "26227", "2": "71747", "3": "71717", "4": "55711", "5": "74717", "6": "74757"}
+_GLYPHS |= {"7": "71222", "8": "75757", "9": "75717", ".": "00002", "e": "74647", "-": "00700", "+": "02720"}
+_BAR, _LINE = 46, 7  # pixels: a bar's length, a line's height
 
 
 def ramp(values: Tensor, anchors: tuple[tuple[float, float, float], ...]) -> Tensor:
@@ -43,14 +47,38 @@ def hues(turns: Tensor) -> Tensor:
 
 
 def depth_colors(depth: Tensor, opacity: Tensor) -> Tensor:
-    """Draw depth (H, W) over white, near bright; the scale spans opaque pixels but 1 % at either end."""
+    """Draw depth (H, W) over white, near bright, with its scale in the lower right corner, in world units.
+
+    The scale spans opaque pixels but 1 % at either end. A small image has none.
+    """
     solid = depth[opacity > 0.5]
     if not len(solid):
         return depth.new_ones(*depth.shape, 3)
     near, far = torch.quantile(solid[:: max(1, len(solid) // 100_000)], depth.new_tensor([0.01, 0.99]))
     span = torch.maximum(far - near, 1e-6 * far).clamp(min=torch.finfo(depth.dtype).tiny)
     colors = ramp((far - depth) / span, _DEPTH)
-    return torch.lerp(torch.ones_like(colors), colors, opacity[..., None].clamp(0, 1))
+    colors = torch.lerp(torch.ones_like(colors), colors, opacity[..., None].clamp(0, 1))
+    scale = at_least(depth_scale(float(near), float(far)), _LINE * max(2, min(depth.shape) // 100)).to(colors)
+    height, width = scale.shape[:2]
+    if height < depth.shape[0] and width < depth.shape[1]:
+        colors[-height:, -width:] = scale
+    return colors
+
+
+def depth_scale(near: float, far: float) -> Tensor:
+    """Draw the bar of depth colours (14, 48, 3) over white, its ends as numbers of three digits above it."""
+    drawn = torch.ones(2 * _LINE, _BAR + 2, 3)
+    drawn[_LINE:-1, 1:-1] = ramp(torch.linspace(1, 0, _BAR), _DEPTH)
+    ends = [_written(f"{value:.3g}") for value in (near, far)]
+    for ink, left in zip(ends, (1, 1 + _BAR - ends[1].shape[1])):
+        drawn[1:6, left : left + ink.shape[1]][ink] = 0.0
+    return drawn
+
+
+def _written(number: str) -> Tensor:
+    """Return which pixels (5, 4 N - 1) of a line the N characters of a number fill."""
+    rows = [[int(_GLYPHS[c][row]) << 1 >> 3 - x & 1 for c in number for x in range(4)] for row in range(5)]
+    return torch.tensor(rows, dtype=torch.bool)[:, :-1]
 
 
 def error_colors(a: Tensor, b: Tensor, full: float = 0.25) -> Tensor:
