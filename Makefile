@@ -1,5 +1,5 @@
 .DEFAULT_GOAL := help
-.PHONY: help install install-launchers install-browser demo demo-lego-complete demo-hypernerf demo-nhr test test-slow \
+.PHONY: help install install-launchers install-trackers install-browser demo demo-lego-complete demo-hypernerf demo-nhr test test-slow \
 	conformance test-stability bench bench-gpu effects accuracy-time price-list reproduce-tables ablations docs docs-serve \
 	lint format clean
 SHELL := bash
@@ -22,6 +22,8 @@ install: ## create .venv with forewarp and all extras except the launchers of sw
 	$(ADD) '.[cpu,synth,plots,viewer,export,usd,capture,dev]'
 install-launchers: ## add joblib, Ray and submitit for sweeps (launcher=...), and Optuna (sweeps=search)
 	$(ADD) '.[sweeps]'
+install-trackers: ## add Weights & Biases and MLflow (logger=wandb, logger=mlflow)
+	$(ADD) '.[trackers]'
 install-browser: ## add a headless Chromium and playwright, which test the viewer's page; as root, on Debian
 	command -v chromium >/dev/null || { apt-get update -qq && \
 		apt-get install -y -qq --no-install-recommends chromium fonts-dejavu-core >/dev/null; }

@@ -147,7 +147,7 @@ def test_what_is_typed_trains_and_trains_again_without_trust(ok, found, sheen):
     assert config["data"]["_target_"] == "mine.data.MineDataModule"
     assert config["model"]["view_dependence"]["_target_"] == "mine.effects.Sheen"
     assert config["trust"] is None
-    assert "mine/psnr" in (sheen / "coarse" / "csv" / "metrics.csv").read_text()
+    assert "mine/psnr" in (sheen / "plain" / "metrics.csv").read_text()
     words = ["train", *found, *SHEEN, "run=run"]
     assert ok(*words).out.startswith("measured before")
     (sheen / "metrics.json").unlink()

@@ -1,15 +1,15 @@
 from dataclasses import replace
+from functools import partial
 
 import lightning
 import pytest
 import torch
-from lightning.pytorch.loggers import TensorBoardLogger
-from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from forewarp.data.module import SceneDataModule
 from forewarp.evaluation.curves import COLUMNS, AccuracyCurve
 from forewarp.files import read_rows
 from forewarp.scene.frame import Truth
+from forewarp.training.loggers import CsvLogger, RunLoggers
 from forewarp.training.stages import Run
 from tests.support.tiny_scene import Interrupt, ball_scene, forward_model, stage, trainer
 
@@ -45,14 +45,14 @@ def scene_with_truth(views=0):
 def run(folder, *more, curve=True, held_out=3, scene=scene_with_truth, stages=("coarse",)):
     """A run of 7 steps whose curve is due after 2, 4, 8, ... steps."""
 
-    def make_trainer(where, own):
-        logger = TensorBoardLogger(save_dir=str(where), name="tensorboard", version="")
-        return trainer(own, logger=logger, default_root_dir=str(where))
+    def make_trainer(where, own, loggers):
+        return trainer(own, logger=loggers, default_root_dir=str(where))
 
     callbacks = [Tick(), *([AccuracyCurve(first=2000, ratio=2.0, rays=100)] if curve else []), *more]
     data = SceneDataModule(scene, rays=64, held_out=held_out)
     stages = [stage(name, iterations=7) for name in stages]
-    return Run(data, forward_model(), stages, folder, make_trainer, lambda name, where: callbacks)
+    loggers = RunLoggers({"csv": partial(CsvLogger, version="")}, folder)
+    return Run(data, forward_model(), stages, folder, make_trainer, lambda *_: callbacks, loggers=loggers)
 
 
 def steps(folder):
@@ -83,12 +83,11 @@ def test_rows_of_the_held_out_views_lie_at_geometric_moments_and_at_the_end(watc
     pixels = torch.randperm(256, generator=torch.Generator().manual_seed(0))[:100]
     expected = sum(float(module.psnr_of(view, pixels)) for view in views) / 3
     assert float(rows[-1]["psnr"]) == pytest.approx(expected, abs=1e-3)
-    accumulator = EventAccumulator(str(folder / "coarse" / "tensorboard"))
-    accumulator.Reload()
-    for column in ("psnr", "epe_moving"):
-        points = accumulator.Scalars(f"curve/{column}")
-        assert [p.step for p in points] == [round(1000 * float(row["seconds"])) for row in rows]
-        assert [p.value for p in points] == pytest.approx([float(row[column]) for row in rows], rel=1e-4)
+    logged = read_rows(folder / "csv" / "metrics.csv")
+    assert [row["step"] for row in logged] == [row["step"] for row in rows]
+    for column in ("psnr", "epe_moving", "seconds"):
+        points = [float(row[f"curve/{column}"]) for row in logged]
+        assert points == pytest.approx([float(row[column]) for row in rows], rel=1e-4)
 
 
 def test_it_changes_no_weight_and_its_seconds_do_not_count(watched, tmp_path, monkeypatch):

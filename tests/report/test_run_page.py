@@ -152,7 +152,7 @@ def test_what_a_file_says_is_text_and_never_markup(tmp_path):
         ({"curve": None}, "No PSNR against training time", "PSNR while it learned"),
         ({"views": 0}, "No PSNR by view and through the scene's time", "view, from worst to best"),
         ({"views": 1}, "Through the scene's time", "No PSNR by view"),
-        ({}, "No loss: the folders of the stages have no TensorBoard events", "What is minimised"),
+        ({}, "No loss: neither TensorBoard's events nor csv/metrics.csv", "What is minimised"),
         ({}, "No pictures: the run's folder has none", "Pictures are"),
         (
             {},

@@ -72,7 +72,7 @@ def test_a_device_that_is_not_there_is_refused(machine, accelerator, text):
 def test_training_and_evaluation_use_the_same_device(machine, tmp_path):
     machine(apple=True)  # which Lightning would take
     run = build_run(config_of("trainer=auto"))
-    trainer = run.make_trainer(tmp_path, [])
+    trainer = run.make_trainer(tmp_path, [], [])
     assert trainer.strategy.root_device == run.device == torch.device("cpu")
 
 

@@ -40,7 +40,7 @@ TARGETS = [
     *("lightning.pytorch.loggers.tensorboard.SummaryWriter", "lightning.pytorch.profilers.PyTorchProfiler"),
     *("lightning.pytorch.callbacks.os.system", "lightning.pytorch.callbacks.ModelCheckpoint"),
     # what modules of ours import, though ours it is or looks
-    *("forewarp.training.checkpoints.lightning.Trainer", "forewarp.training.callbacks.TensorBoardLogger"),
+    *("forewarp.training.checkpoints.lightning.Trainer", "forewarp.training.loggers.TensorBoardLogger"),
     *("forewarp.training.checkpoints.torch.package.PackageExporter", "forewarp.training.stages.Curriculum"),
     *("forewarp.training.stages.Run.__class__", "forewarp.no.such.thing", "forewarp.", "forewarp"),
     *("forewarped.Thing", "", 7, None, ["os.system"]),
@@ -57,9 +57,9 @@ def test_what_is_no_class_of_ours_is_refused(target):
 
 
 @pytest.mark.parametrize("key", ["name", "version", "sub_dir"])
-def test_a_logger_stays_in_the_folder_of_its_stage(key):
-    for logger in ("TensorBoardLogger", "CSVLogger"):
-        node = {"_target_": f"lightning.pytorch.loggers.{logger}"}
+def test_a_logger_stays_in_the_folder_of_its_run(key):
+    for logger in ("lightning.pytorch.loggers.TensorBoardLogger", "forewarp.training.loggers.CsvLogger"):
+        node = {"_target_": logger}
         read(OmegaConf.to_yaml({"logger": node | {key: "name"}}))
         for value in ("/tmp/x", "..", "../x", "a/b", "a\\b", ["x"]):
             with pytest.raises(ValueError, match=f"logger.{key}: expected the name of a folder, but got"):

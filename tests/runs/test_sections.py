@@ -82,5 +82,5 @@ def test_options_are_listed_beside_files():
 
 
 def test_a_plain_value_is_that_of_the_groups_key():
-    config = composed("model/rotation=none", "model/color_over_time=cosines", "logger=none")
-    assert (config.model.rotation, config.model.color_over_time, config.logger) == (None, 2, None)
+    config = composed("model/rotation=none", "model/color_over_time=cosines")
+    assert (config.model.rotation, config.model.color_over_time) == (None, 2)

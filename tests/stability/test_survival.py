@@ -12,6 +12,7 @@ import pytest
 import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+from forewarp.files import read_rows
 from forewarp.synth.scenes import synthesize
 from tests.support.zygote import Zygote
 
@@ -171,17 +172,22 @@ def test_killed_at_random_moments(zygote, begin, scenes, whole, tmp_path):
 
 
 def steps_of(run):
-    """The steps of which TensorBoard has a loss, by stage."""
-    steps = {}
-    for stage in STAGES:
-        events = EventAccumulator(str(run / stage / "tensorboard"))
-        events.Reload()
-        steps[stage] = sorted({scalar.step for scalar in events.Scalars("train/loss")})
-    return steps
+    """The steps of which TensorBoard has a loss, and of which the CSV file has one."""
+    events = EventAccumulator(str(run / "tensorboard"))
+    events.Reload()
+    rows = read_rows(run / "csv" / "metrics.csv")
+    return [scalar.step for scalar in events.Scalars("train/loss")], [
+        int(row["step"]) for row in rows if row["train/loss"]
+    ]
 
 
-def test_killed_while_tensorboard_is_on(begin, tmp_path):
-    watched = ["logger=tensorboard", "callbacks.scalars.every=1", "evaluate=false", "checkpoint_seconds=0"]
+def test_killed_while_loggers_are_on(begin, tmp_path):
+    watched = [
+        "logger=[tensorboard,csv]",
+        "callbacks.scalars.every=1",
+        "evaluate=false",
+        "checkpoint_seconds=0",
+    ]
     whole, killed = tmp_path / "whole", tmp_path / "killed"
     assert begin(whole, *watched)[0] == 0
     for die in ([2, "after", "coarse/last.ckpt"], [3, "after", "fine/last.ckpt"]):

@@ -187,7 +187,7 @@ def make_run(folder, stages, *, data=None, model=None, callbacks=(), **changes):
         model or forward_model(),
         stages,
         Path(folder),
-        lambda where, own: trainer(own),
+        lambda where, own, loggers: trainer(own, logger=loggers, default_root_dir=str(where)),
         callbacks=lambda name, where: list(callbacks),
         **changes,
     )

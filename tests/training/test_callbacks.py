@@ -9,26 +9,24 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from forewarp.clock import Clock
 from forewarp.data.module import SceneDataModule
-from forewarp.evaluation.images import TensorBoardImages
+from forewarp.evaluation.images import TrainingImages
 from forewarp.progress import ProgressLine
-from forewarp.training.callbacks import StageProgress, TensorBoardScalars
-from tests.support.tiny_scene import Interrupt, ball_data, ball_scene, make_run, same, stage, trainer
+from forewarp.training.callbacks import Scalars, StageProgress
+from forewarp.training.loggers import RunLoggers
+from tests.support.tiny_scene import Interrupt, ball_data, ball_scene, make_run, same, stage
 
 STEPS = 12
 
 
 def watched_run(folder, *callbacks, steps=STEPS):
     """A run of one short stage over the ball, with a TensorBoard logger as the command has it."""
-    run = make_run(folder, [stage(iterations=steps)], callbacks=callbacks)
-    logger = partial(TensorBoardLogger, name="tensorboard", version="")
-    run.make_trainer = lambda where, own: trainer(
-        own, logger=logger(save_dir=str(where)), default_root_dir=str(where)
-    )
-    return run
+    logger = partial(TensorBoardLogger, name="tensorboard", version="", default_hp_metric=False)
+    loggers = RunLoggers({"tensorboard": logger}, folder)
+    return make_run(folder, [stage(iterations=steps)], callbacks=callbacks, loggers=loggers)
 
 
 def all_watchers():
-    return StageProgress(every=0), TensorBoardScalars(every=5), TensorBoardImages(moments=(0.25, 0.5, 1.0))
+    return StageProgress(every=0), Scalars(every=5), TrainingImages(moments=(0.25, 0.5, 1.0))
 
 
 class Record(lightning.Callback):
@@ -42,7 +40,7 @@ class Record(lightning.Callback):
 
 
 def events_of(folder):
-    accumulator = EventAccumulator(str(folder / "coarse" / "tensorboard"))
+    accumulator = EventAccumulator(str(folder / "tensorboard"))
     accumulator.Reload()
     return accumulator
 
@@ -100,7 +98,7 @@ def test_every_named_curve_is_there_and_a_mean_over_the_steps_between(watched):
 
 def test_without_validation_views_there_is_no_validation_curve(tmp_path):
     scene = replace(ball_scene(), val=())
-    ours = watched_run(tmp_path, TensorBoardImages(moments=(1.0,)), steps=2)
+    ours = watched_run(tmp_path, TrainingImages(moments=(1.0,)), steps=2)
     ours.datamodule = SceneDataModule(lambda: scene, rays=64)
     ours.fit()
     tags = events_of(tmp_path).Tags()
@@ -138,17 +136,17 @@ def test_the_clock_stands_still_while_something_is_shown(tmp_path, monkeypatch):
     note(ProgressLine, "show")
     note(TensorBoardLogger, "log_metrics")
     monkeypatch.setattr("forewarp.training.module.Clock", lambda: clock)
-    watched_run(tmp_path, StageProgress(every=0), TensorBoardScalars(every=5)).fit()
+    watched_run(tmp_path, StageProgress(every=0), Scalars(every=5)).fit()
     assert set(running) == {("show", False), ("log_metrics", False)}
 
 
 @pytest.mark.parametrize(
     ("make", "text"),
     [
-        (lambda: TensorBoardScalars(every=0), "every: expected at least 1 step, but got 0"),
-        (lambda: TensorBoardImages(moments=(0.5, 1.5)), r"moments: expected numbers in \[0, 1\], but got"),
-        (lambda: TensorBoardImages(psnr_rays=0), "expected psnr_views >= 0 and psnr_rays >= 1, but got"),
-        (lambda: TensorBoardImages(moments=(0.1,), view=7), "pictures.view: expected 0 to 0, but got 7"),
+        (lambda: Scalars(every=0), "every: expected at least 1 step, but got 0"),
+        (lambda: TrainingImages(moments=(0.5, 1.5)), r"moments: expected numbers in \[0, 1\], but got"),
+        (lambda: TrainingImages(psnr_rays=0), "expected psnr_views >= 0 and psnr_rays >= 1, but got"),
+        (lambda: TrainingImages(moments=(0.1,), view=7), "pictures.view: expected 0 to 0, but got 7"),
     ],
 )
 def test_bad_settings_are_named(tmp_path, make, text):

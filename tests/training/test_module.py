@@ -167,7 +167,7 @@ def fitted(folder, own, limit=0.0, steps=5, **changes):
     made = tiny.stage(weights={"photo": 1.0}, iterations=steps, lr={"network": 0.1}, max_gradient=limit)
     made.settings.numbers.clear()
     run = tiny.make_run(folder, [made], data=DATA, model=partial(Plane, own=own))
-    run.make_trainer = lambda where, callbacks: tiny.trainer(callbacks, **changes)
+    run.make_trainer = lambda where, callbacks, loggers: tiny.trainer(callbacks, **changes)
     return run.fit()
 
 

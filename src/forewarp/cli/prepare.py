@@ -78,6 +78,7 @@ class Prepared:
 
                 stack.enter_context(live(self.run, **self.viewer))
             stack.enter_context(session(self.run, self.config, finished=self.measured))
+            stack.enter_context(self.run.loggers)
             if self.plan is not None:
                 replace_file(Path(self.run.folder) / "plan.yaml", self.plan)
             yield

@@ -34,15 +34,16 @@ What one types most (options such as --multirun or --config-dir=FOLDER come firs
   data.held_out=N                     hold N training views out and record their PSNR against training time
   dataset=dnerf data.scene=hook       a scene of a dataset below paths.scenes=FOLDER, here FOLDER/dnerf/hook
   ablation=NAME                       an ablation of the paper; ablation=full is its whole method
+  logger=tensorboard|csv|wandb|mlflow|none   where curves and scores go; several: logger=[tensorboard,mlflow]
   launcher=local|joblib|ray|slurm|submitit   where the jobs of --multirun run
   ~stage.fine                         drop a stage
   --multirun seeds=3                  one run after another; --multirun sweeps=dnerf: a prepared sweep
   --multirun sweeps=accuracy_time stage.fine.density=45,180  what choices cost; see forewarp-report
   --multirun sweeps=price_list_particles seeds=2  the same for every choice, one at a time; also _forward
 
-A run's folder holds config.yaml, a folder for each stage (checkpoint, handover.json, TensorBoard events,
-images), images/ of the test views, per_image.json and metrics.json. With data.held_out or validation views it
-also holds accuracy_time.csv and accuracy_time.png.
+A run's folder holds config.yaml, a folder for each stage (checkpoint, handover.json, images), images/ of the
+test views, per_image.json and metrics.json. With data.held_out or validation views it also holds
+accuracy_time.csv and accuracy_time.png.
 Watch: tensorboard --logdir runs
 """
 
@@ -84,11 +85,11 @@ def measure(prepared, module) -> float | None:
     """Measure a fitted run, or say how to; draw its curve; return the score."""
     from forewarp.evaluation.evaluate import notes_of
     from forewarp.report.figures import draw_own
-    from forewarp.runs.fitted import doubts, measure_run, tell
+    from forewarp.runs.fitted import doubts, log_scores, measure_run, tell
 
     run, config = prepared.run, prepared.config
     if config.evaluate:
-        measure_run(run, module, config)
+        log_scores(run, measure_run(run, module, config))
     else:
         fitted = f"fitted: {run.folder}; measure it with forewarp-evaluate {quote(f'run={run.folder}')}"
         print(fitted, *notes_of(module.method.protocol()), sep="\n")

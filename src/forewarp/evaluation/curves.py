@@ -7,11 +7,11 @@ import math
 from pathlib import Path
 
 import lightning
-from lightning.pytorch.loggers import TensorBoardLogger
 
 from forewarp.evaluation.evaluate import flow_error
 from forewarp.evaluation.images import validation_psnr
 from forewarp.files import read_json, read_rows, written_whole
+from forewarp.training.loggers import log_scalars
 
 FILE = "accuracy_time.csv"
 COLUMNS = ("seconds", "stage", "step", "psnr", "epe_moving", "size")
@@ -36,8 +36,8 @@ class AccuracyCurve(lightning.Callback):
     A row holds ``seconds`` of training over all stages (the clock stands still while a row is made),
     ``stage``, ``step`` of the stage, ``psnr`` (dB, mean over the views, from the same random pixels of each),
     ``epe_moving`` (world units; empty if the scene has no true trajectories) and the method's ``size``
-    (voxels, particles, parameters). TensorBoard gets ``curve/psnr`` and ``curve/epe_moving`` against
-    milliseconds of training. A resumed run continues its rows.
+    (voxels, particles, parameters). The loggers get ``curve/psnr``,
+    ``curve/epe_moving`` and ``curve/seconds``. A resumed run continues its rows.
 
     Args:
         first: seconds until the first row.
@@ -103,10 +103,8 @@ class AccuracyCurve(lightning.Callback):
                 writer = csv.DictWriter(file, COLUMNS, restval="")
                 writer.writeheader()
                 writer.writerows(self._rows)
-            for logger in trainer.loggers:
-                if isinstance(logger, TensorBoardLogger):
-                    curve = {f"curve/{name}": value for name, value in scores.items()}
-                    logger.log_metrics(curve, round(1000 * seconds))
+            curve = {f"curve/{name}": value for name, value in scores.items()} | {"curve/seconds": seconds}
+            log_scalars(trainer.loggers, curve, module.run_step)
         self._next = next_moment(seconds, self.first, self.ratio)
 
 

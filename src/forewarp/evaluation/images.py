@@ -7,7 +7,6 @@ from pathlib import Path
 
 import lightning
 import torch
-from lightning.pytorch.loggers import TensorBoardLogger
 from torch import Tensor
 
 from forewarp.drawing.images import (
@@ -22,6 +21,7 @@ from forewarp.drawing.images import (
 from forewarp.methods.method import HasTrajectories, Method, Snapshot
 from forewarp.scene.camera import Camera, focus_point, mean_up, orbit, swing
 from forewarp.scene.view import Moment, Rendering, Target, View
+from forewarp.training.loggers import log_image, log_scalars
 from forewarp.training.module import DynamicSceneModule
 
 PATHS = ("fixed", "swing", "orbit", "both", "trajectories")  # of videos
@@ -176,10 +176,10 @@ def moving_share(method: Method, moving: Tensor, camera: Camera, time: float) ->
     return share.reshape(camera.height, camera.width)
 
 
-class TensorBoardImages(lightning.Callback):
+class TrainingImages(lightning.Callback):
     """Draw one view at a few moments of a stage, and log ``val/psnr`` of a few validation views.
 
-    Images go to TensorBoard and into the stage's ``images/``. Training is not changed: the clock is paused
+    Images go to the loggers and into the stage's ``images/``. Training is not changed: the clock is paused
     and no random number is drawn.
 
     Args:
@@ -228,20 +228,16 @@ class TensorBoardImages(lightning.Callback):
             return
         self._due = self._due[len(passed) :]
         folder, number = Path(trainer.default_root_dir) / "images", f"{round(100 * passed[-1]):03d}"
-        loggers = [logger for logger in trainer.loggers if isinstance(logger, TensorBoardLogger)]
         with module.clock.paused():
             for name, image in images_of(module, self._target(trainer.datamodule), self.size).items():
                 write_png(folder / f"{number}_{name}.png", image)
-                for logger in loggers:
-                    step = module.global_step
-                    logger.experiment.add_image(f"images/{name}", image, step, dataformats="HWC")
+                log_image(trainer.loggers, f"images/{name}", image, module.run_step)
             views = trainer.datamodule.targets("val")
             count = min(self.psnr_views, len(views))
-            if loggers and count:
+            if trainer.loggers and count:
                 chosen = [views[i * len(views) // count] for i in range(count)]
                 psnr = validation_psnr(module, chosen, self.psnr_rays)
-                for logger in loggers:
-                    logger.log_metrics({"val/psnr": psnr}, module.global_step)
+                log_scalars(trainer.loggers, {"val/psnr": psnr}, module.run_step)
 
     def _target(self, datamodule) -> Target:
         targets = datamodule.targets("val" if datamodule.scene.val else "train")

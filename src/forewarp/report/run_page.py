@@ -122,10 +122,14 @@ def read_story(folder: Path) -> Row:
 
 
 def _read_losses(row: Row, stages: Sequence[str]) -> dict[str, list[tuple[float, float]]]:
-    """Read each stage's loss from TensorBoard's events, against seconds of training."""
+    """Read each stage's loss from what a logger wrote, against seconds of training."""
     losses, before, moments = {}, 0.0, read_rows(row["folder"] / "accuracy_time.csv")
+    logged, first = _loss(row["folder"]), 0
     for stage in stages:
-        loss, done = _loss(row["folder"] / stage / "tensorboard"), row["stages"].get(stage)
+        done = row["stages"].get(stage)
+        last = math.inf if done is None else first + int(done["steps"])
+        loss = [(step - first, value) for step, value in logged if first < step <= last]
+        first = last
         # The known moments of a stage: its step -> seconds of training over all stages.
         known = {0: before}
         known |= {int(m["step"]): float(m["seconds"]) for m in moments if m.get("stage") == stage}
@@ -140,10 +144,12 @@ def _read_losses(row: Row, stages: Sequence[str]) -> dict[str, list[tuple[float,
     return losses
 
 
-def _loss(folder: Path) -> list[tuple[int, float]]:
-    """Return (step, loss) of TensorBoard's events; later events replace earlier ones."""
+def _loss(run: Path) -> list[tuple[int, float]]:
+    """Return (step of the run, loss) of TensorBoard's events, or else of the CSV logger's rows."""
+    folder = run / "tensorboard"
     if not folder.is_dir():
-        return []
+        rows = [row for row in read_rows(run / "csv" / "metrics.csv") if row.get("train/loss")]
+        return [(int(row["step"]), float(row["train/loss"])) for row in rows]
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
     kept = {"scalars": 0, "images": 1, "tensors": 1, "histograms": 1, "audio": 1, "compressedHistograms": 1}

@@ -13,8 +13,9 @@ from hydra.utils import get_object, instantiate
 from omegaconf import DictConfig, OmegaConf
 
 from forewarp.clock import Clock
-from forewarp.runs.config import instead_of
+from forewarp.runs.config import IDENTITY, instead_of
 from forewarp.training.callbacks import StageProgress
+from forewarp.training.loggers import RunLoggers
 from forewarp.training.schedule import StagePlan, seconds_after, share_out
 from forewarp.training.stages import Run
 
@@ -34,16 +35,16 @@ def build_run(config: DictConfig) -> Run:
     data = instantiate(config.data, _convert_="all")
     plans = {name: stage_of(name, stage) for name, stage in config.stage.items()}
     factories = [make for make in instantiate(config.callbacks, _convert_="all").values() if make is not None]
-    trainer, logger = (instantiate(config[key], _convert_="all") for key in ("trainer", "logger"))
+    trainer = instantiate(config.trainer, _convert_="all")
 
-    def make_trainer(folder: Path, callbacks: list):
+    def make_trainer(folder: Path, callbacks: list, loggers: list):
         return trainer(
             # With auto, Lightning would choose a Mac's GPU, which lacks float64.
             accelerator=device().type,
             max_epochs=1,
             max_steps=-1,
             callbacks=callbacks,
-            logger=False if logger is None else logger(save_dir=str(folder)),
+            logger=loggers,
             default_root_dir=str(folder),
             enable_checkpointing=False,
             enable_progress_bar=False,
@@ -72,9 +73,52 @@ def build_run(config: DictConfig) -> Run:
         tell=partial(print, flush=True),
         clock=Clock(config.budget.clock).kind,
         place=device,
+        loggers=loggers_of(config),
     )
     run.check()
     return run
+
+
+def loggers_of(config: DictConfig) -> RunLoggers:
+    """Make the loggers of a run, each by its name.
+
+    Raises:
+        ValueError: for a logger without a name.
+        ImportError: naming what to install.
+    """
+    named = config.get("logger") or {}
+    if "_target_" in named or not all(OmegaConf.is_dict(node) for node in named.values()):
+        raise ValueError(
+            "logger: expected loggers by name, as logger: {csv: {_target_: ...}}, but got one without; "
+            "write its keys below a name"
+        )
+    makers = instantiate(named, _convert_="all")
+    runs = OmegaConf.select(config, "paths.runs") or Path(config.run).parent
+    return RunLoggers(makers, Path(config.run), Path(runs), hyperparameters(config) if makers else {})
+
+
+def hyperparameters(config: DictConfig) -> dict[str, object]:
+    """List what makes a run what it is, by flat names and without paths, for the tables of its loggers.
+
+    A part of a method is named by its class: ``model.radiance: Grid``.
+    """
+    found: dict[str, object] = {}
+
+    def walk(value: object, name: str) -> None:
+        if isinstance(value, dict):
+            if "_target_" in value:
+                found[name] = str(value["_target_"]).rpartition(".")[2]
+            for key, inner in value.items():
+                if not key.startswith("_"):
+                    walk(inner, f"{name}.{key}")
+        elif name not in ("data.root", "trainer.accelerator", "trainer.devices"):
+            found[name] = value if isinstance(value, bool | int | float | str) else str(value)
+
+    for key in (*IDENTITY, "capture", "variant", "threads", "trainer"):
+        value = config.get(key)
+        if value is not None:
+            walk(OmegaConf.to_container(value, resolve=True) if OmegaConf.is_config(value) else value, key)
+    return found
 
 
 def model_of(config: DictConfig) -> Callable:

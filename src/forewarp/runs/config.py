@@ -6,6 +6,7 @@ that the user trusts, and nothing else. Nothing here loads torch, so a mistyped 
 
 from __future__ import annotations
 
+import glob
 import hashlib
 import importlib
 import inspect
@@ -19,6 +20,7 @@ from pathlib import Path
 
 import yaml
 from hydra.core.hydra_config import HydraConfig
+from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
@@ -32,7 +34,7 @@ HASH = "{hash}"
 # May be set beside resume=<run>.
 MAY_CHANGE = (
     *("trainer", "threads", "lpips_weights", "sheets", "views", "reduce", "evaluate", "checkpoint_seconds"),
-    *("sentinel", "data_changed", "score", "viewer", "host", "port"),
+    *("sentinel", "data_changed", "score", "viewer", "host", "port", "logger"),
 )
 MOST_LEVELS = 40
 MOST_SEED = 2**31 - 100  # each stage adds its number, and what finds poses takes 31 bits
@@ -42,7 +44,9 @@ ELSEWHERE = {
     "lightning.Trainer",
     "lightning.pytorch.Trainer",
     "lightning.pytorch.loggers.CSVLogger",
+    "lightning.pytorch.loggers.MLFlowLogger",
     "lightning.pytorch.loggers.TensorBoardLogger",
+    "lightning.pytorch.loggers.WandbLogger",
 }
 # Where a config may name our own classes: key at the top -> beginnings of their full names. Classes that
 # write to a path, such as the checkpoints' callback, are in none of these modules.
@@ -54,10 +58,10 @@ HOMES = {
     "stage": (*_PARTS_OF_METHODS, "forewarp.training.objective.", "forewarp.training.schedule."),
     "callbacks": (
         "forewarp.training.callbacks.",
-        *("forewarp.evaluation.curves.AccuracyCurve", "forewarp.evaluation.images.TensorBoardImages"),
+        *("forewarp.evaluation.curves.AccuracyCurve", "forewarp.evaluation.images.TrainingImages"),
     ),
     "trainer": ("lightning.Trainer", "lightning.pytorch.Trainer"),
-    "logger": ("lightning.pytorch.loggers.",),
+    "logger": ("lightning.pytorch.loggers.", "forewarp.training.loggers.CsvLogger"),
 }
 # What other templates have as trainers: why there is none here, and what to type.
 _ONE_PROCESS = (
@@ -74,23 +78,51 @@ _UNREADABLE = (
     *(RecursionError, OverflowError),
 )
 _PARTS = {"name", "version", "sub_dir"}  # keys that make up the path a logger writes to
-_PLAIN = {"default_hp_metric", "flush_logs_every_n_steps", "log_graph", "prefix"}  # its others
+# Its others.
+_PLAIN = {"default_hp_metric", "flush_logs_every_n_steps", "log_graph", "prefix"}
+_PLAIN |= {"project", "entity", "group", "tags", "notes", "job_type", "offline", "experiment_name"}
+_NAMED = ("model", "preset", "seed", "data", "data.root", "data.scene", "data.held_out")  # see ``in_words``
+UNUSED = ("logger", "callbacks")  # parts of a config that only training uses
 
 
 def hashed(config: DictConfig) -> DictConfig:
     """Replace ``{hash}`` in the key ``run`` by ten digits of a hash of the keys that tell runs apart.
 
     So each configuration has a folder of its own, and a finished job is found again. A precision other than
-    32-true counts too, and for a run bounded by minutes the device and the number of threads.
+    32-true counts too, and for a run bounded by minutes the device and the number of threads. Before the
+    digits of a job of a sweep stands what was typed for it; so do they where a sweep names no folders.
     """
-    if HASH in str(config.run):
-        config.run = str(config.run).replace(HASH, content_hash(config))
+    typed = typed_overrides() if HydraConfig.initialized() else []
+    swept = bool(typed) and HydraConfig.get().mode == RunMode.MULTIRUN
+    words, run = in_words(typed) if swept else "", str(config.run)
+    if words and HASH not in run and "run" not in map(key_of, typed):
+        run += f"-{HASH}"
+    if HASH in run:
+        digits = content_hash(config)
+        path, name = Path(run).parent, Path(run).name
+        found = path.glob(glob.escape(name).replace(HASH, f"*{digits}"))
+        config.run = str(next(found, path / name.replace(HASH, "-".join(filter(None, (words, digits))))))
     return config
 
 
 def instead_of(trainer: str) -> str:
     """Say what to type in place of a trainer or accelerator that there is not, and why where it is known."""
     return _NO_TRAINERS.get(trainer, "use trainer=auto")
+
+
+def in_words(overrides: Sequence[str]) -> str:
+    """Name a job of a sweep by what was typed for it, but for what its folder's name says by itself.
+
+    >>> in_words(["model=forward", "stage.fine.lr.means=1e-3", "model/view_dependence=sh", "~stage.coarse"])
+    'means-1e-3-view_dependence-sh-without-coarse'
+    """
+    words = []
+    for override in overrides:
+        key, value = key_of(override), override.partition("=")[2]
+        first, last = re.split(r"[./]", key)[0], re.split(r"[./]", key)[-1]
+        if first in (*IDENTITY, "ablation", "capture") and key not in _NAMED and value != "null":
+            words.append(f"without-{last}" if override.startswith("~") else f"{last}-{value}")
+    return re.sub(r"[^\w.-]+", "_", "-".join(words))[:60].strip("-_.")
 
 
 def content_hash(config: DictConfig, more: Sequence[str] = (), *others: object) -> str:
@@ -133,7 +165,8 @@ def saved_config(run: str | None, changes: DictConfig, key: str = "run") -> Dict
         raise ValueError(
             f"{path}: expected the configuration of a run, but got none; set {key}=<a run's folder>"
         )
-    saved = read_config(path, trust_of(changes.get("trust")))
+    # Without trust, what serves training alone is left out rather than refused.
+    saved = read_config(path, trust_of(changes.get("trust")), () if key == "resume" else UNUSED)
     for name in ("trainer", "threads", "lpips_weights", "sheets"):
         if changes.get(name) is not None:
             saved[name] = changes[name]
@@ -157,6 +190,7 @@ def resumed(config: DictConfig) -> DictConfig:
     trust = OmegaConf.create({"trust": config.get("trust")})
     saved = saved_config(str(config.resume), trust, "resume")
     saved.resume, saved.data_changed = str(config.resume), "refuse"
+    saved.paths = config.get("paths")  # where loggers write beside the run, as this command has it
     for override in typed_overrides(of_sweep=True) if HydraConfig.initialized() else []:
         key = key_of(override)
         if key == "data.root":
@@ -171,14 +205,14 @@ def resumed(config: DictConfig) -> DictConfig:
     return saved
 
 
-def read_config(path: Path, trust: Sequence[str] | None = ()) -> DictConfig:
-    """Read the config in a run's folder; ``trust`` as in ``trusted_config``.
+def read_config(path: Path, trust: Sequence[str] | None = (), unused: Sequence[str] = ()) -> DictConfig:
+    """Read the config in a run's folder; ``trust`` and ``unused`` as in ``trusted_config``.
 
     Raises:
         ValueError: if the file is no config of a run, or names untrusted code.
     """
-    config = trusted_config(read_text(path, MOST_CONFIG), path, trust)
-    for key in (*IDENTITY, "trainer", "logger", "callbacks"):
+    config = trusted_config(read_text(path, MOST_CONFIG), path, trust, unused)
+    for key in (*IDENTITY, "trainer", "callbacks"):
         if key not in config and key != "objective":  # a method may have no objective
             raise ValueError(f"{path}: expected the key {key}, but got none; delete the run's folder")
     return config
@@ -241,7 +275,9 @@ def make_absolute(config: DictConfig) -> None:
         config.data.root = str(Path(config.data.root).expanduser().resolve())
 
 
-def trusted_config(text: str, where: Path, trust: Sequence[str] | None = ()) -> DictConfig:
+def trusted_config(
+    text: str, where: Path, trust: Sequence[str] | None = (), unused: Sequence[str] = ()
+) -> DictConfig:
     """Parse a resolved config; refuse a config that is not safe to instantiate.
 
     Args:
@@ -249,11 +285,12 @@ def trusted_config(text: str, where: Path, trust: Sequence[str] | None = ()) -> 
         where: the file, named in errors.
         trust: packages whose code the config may name; no other package is imported.
             None: do not check targets, for a config that is only compared and never instantiated.
+        unused: keys that are emptied, and so not checked.
 
     Raises:
         ValueError: if the text is no YAML mapping, has aliases or interpolations, or is nested too deep; if a
             ``_target_`` is neither a class of forewarp (named by the module that defines it), nor in
-            ``ELSEWHERE``, nor defined in a trusted package; or if a logger would write outside its stage's
+            ``ELSEWHERE``, nor defined in a trusted package; or if a logger would write outside the run's
             folder.
     """
     try:
@@ -267,6 +304,8 @@ def trusted_config(text: str, where: Path, trust: Sequence[str] | None = ()) -> 
         raise ValueError(f"{where}: expected YAML, but got {reason}; delete the run's folder") from None
     if content is None:
         raise ValueError(f"{where}: expected a mapping, but got another kind; delete the run's folder")
+    for key in unused:
+        config[key] = content[key] = {}
     _check(content, where, "", trust)
     return config
 
@@ -415,10 +454,15 @@ def advice(name: str, trust: Sequence[str] = ()) -> str:
 
 
 def _check_logger(node: dict, where: Path, key: str) -> None:
-    """Refuse a logger that would write outside its stage's folder, by its name or by an option."""
-    if not node["_target_"].startswith("lightning.pytorch.loggers."):
+    """Refuse a logger that would write outside the run's folder, by its name or by an option."""
+    if not node["_target_"].startswith(HOMES["logger"]):
         return
-    if others := sorted(node.keys() - _PARTS - _PLAIN - _RESERVED):
+    if node.get("tracking_uri") is not None:
+        raise ValueError(
+            f"{where}: {key}.tracking_uri: expected null, but got {node['tracking_uri']!r:.80}; set the "
+            "environment's MLFLOW_TRACKING_URI in its place, or add logger=mlflow"
+        )
+    if others := sorted(node.keys() - _PARTS - _PLAIN - _RESERVED - {"tracking_uri"}):
         raise ValueError(
             f"{where}: {key}.{others[0]}: expected one of {', '.join(sorted(_PARTS | _PLAIN))}, but got "
             "another option; delete it"

@@ -309,6 +309,15 @@ def measure_run(run: Run, module: DynamicSceneModule, config: DictConfig) -> dic
     return metrics
 
 
+def log_scores(run: Run, metrics: dict) -> None:
+    """Log the scores of ``metrics.json`` to the run's loggers, as ``test/space/psnr``."""
+    scores = {
+        f"test/{split}/{name}": score for split, of in metrics["test"].items() for name, score in of.items()
+    }
+    scores |= {"test/seconds": sum(metrics["seconds"].values())}
+    run.loggers.log_scores(scores, sum(done["steps"] for done in run.finished().values()))
+
+
 def method_name(config: DictConfig) -> str:
     """Name the measured method: the last stage's own method, else the run's."""
     own = [stage.get("model") for stage in config.stage.values() if stage is not None][-1]

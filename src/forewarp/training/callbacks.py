@@ -1,4 +1,4 @@
-"""What is shown of a stage during training: a progress line and TensorBoard's curves.
+"""What is shown of a stage during training: a progress line and its loggers' curves.
 
 ``StageProgress`` stands in for Lightning's bars: they count batches, know no minutes and need a terminal.
 """
@@ -10,9 +10,9 @@ import time
 from collections import defaultdict
 
 import lightning
-from lightning.pytorch.loggers import TensorBoardLogger
 
 from forewarp.progress import ProgressLine, time_text
+from forewarp.training.loggers import log_scalars
 
 _SMOOTHING = 0.02  # weight of the newest step in the PSNR shown: a mean over about 50 steps
 
@@ -92,7 +92,7 @@ class StageProgress(lightning.Callback):
         return self._speed
 
 
-class TensorBoardScalars(lightning.Callback):
+class Scalars(lightning.Callback):
     """Log the means over the last ``every`` steps: loss, unweighted terms, PSNR, learning rates and counts.
 
     Keys: ``train/<name>`` for all values in ``module.last``, ``lr/<parameter group>``.
@@ -122,6 +122,4 @@ class TensorBoardScalars(lightning.Callback):
         for group in trainer.optimizers[0].param_groups:
             scalars[f"lr/{group['name']}"] = group["lr"]
         with module.clock.paused():
-            for logger in trainer.loggers:
-                if isinstance(logger, TensorBoardLogger):
-                    logger.log_metrics(scalars, module.global_step)
+            log_scalars(trainer.loggers, scalars, module.run_step)

@@ -28,7 +28,8 @@ class DynamicSceneModule(lightning.LightningModule):
         curriculum: draws the frame of every step.
         seed: seed of the random numbers that the method draws.
 
-    ``last`` holds the values of the last step, by the names under which they are logged.
+    ``last`` holds the values of the last step, by the names under which they are logged; ``steps_before``
+    the steps of the run's earlier stages.
     """
 
     def __init__(
@@ -49,6 +50,7 @@ class DynamicSceneModule(lightning.LightningModule):
         self.generator = torch.Generator().manual_seed(seed)
         self.clock = Clock()
         self.last: dict[str, float] = {}
+        self.steps_before = 0
         self._noted: Mapping[str, float] = {}
         self._torch_state: Tensor | None = None
 
@@ -63,6 +65,17 @@ class DynamicSceneModule(lightning.LightningModule):
     def fraction(self) -> float:
         """Fraction of the stage that is done, in [0, 1]."""
         return self.settings.fraction(self.global_step, self.clock.seconds)
+
+    @property
+    def run_step(self) -> int:
+        """Steps of the run so far, over all its stages: the axis of everything that is logged."""
+        return self.steps_before + self.global_step
+
+    def log(self, name: str, value: float | Tensor, *given, **options) -> None:
+        """Log a value as Lightning does, on the axis of the run."""
+        if self.trainer.training and name != "step":
+            super().log("step", float(self.run_step), on_step=True, on_epoch=False)
+        super().log(name, value, *given, **options)
 
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
         """Take one step of the optimiser, and return the loss.
@@ -108,7 +121,7 @@ class DynamicSceneModule(lightning.LightningModule):
     def validation_step(self, target: Target, batch_idx: int) -> Tensor:
         """Log the PSNR of one whole image as ``val/psnr``, for ``trainer.validate``.
 
-        A run does not pause to validate: its curve ``val/psnr`` comes from ``TensorBoardImages``.
+        A run does not pause to validate: its curve ``val/psnr`` comes from ``TrainingImages``.
         """
         psnr = self.psnr_of(target)
         self.log("val/psnr", psnr, batch_size=1, prog_bar=True)

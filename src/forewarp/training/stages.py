@@ -30,6 +30,7 @@ from forewarp.training.checkpoints import (
     make_handover,
     save_handover,
 )
+from forewarp.training.loggers import RunLoggers
 from forewarp.training.module import DynamicSceneModule
 from forewarp.training.schedule import Curriculum, Stage
 from forewarp.training.sentinel import Sentinel
@@ -49,7 +50,7 @@ class Run:
         model: makes the method of a stage that names no model of its own.
         stages: in order.
         folder: the run's folder, with one folder for each stage.
-        make_trainer: ``(stage folder, callbacks) -> lightning.Trainer``.
+        make_trainer: ``(stage folder, callbacks, loggers) -> lightning.Trainer``.
         callbacks: ``(stage name, stage folder) -> list`` of callbacks to add.
         seed: seed of all random numbers.
         checkpoint_seconds: training seconds between two checkpoints.
@@ -57,13 +58,14 @@ class Run:
         tell: called with a line for each stage that is loaded or continued.
         clock: what minutes are of: see ``Clock``.
         place: gives the device that its trainers compute on.
+        loggers: its loggers; whoever fits the run closes them (``with run.loggers``).
     """
 
     datamodule: lightning.LightningDataModule
     model: Model
     stages: Sequence[Stage]
     folder: Path
-    make_trainer: Callable[[Path, list], lightning.Trainer]
+    make_trainer: Callable[[Path, list, list], lightning.Trainer]
     callbacks: Callable[[str, Path], list] = field(default=lambda name, folder: [])
     seed: int = 0
     checkpoint_seconds: float = 60.0
@@ -71,6 +73,7 @@ class Run:
     tell: Callable[[str], None] = lambda line: None
     clock: str = "wall"
     place: Callable[[], torch.device] = lambda: torch.device("cpu")
+    loggers: RunLoggers = field(default_factory=RunLoggers)
 
     @property
     def device(self) -> torch.device:
@@ -111,7 +114,7 @@ class Run:
         self.datamodule.setup("fit")
         finished = [self.is_finished(stage) for stage in self.stages]
         self._check_ahead([stage for stage, done in zip(self.stages, finished) if not done])
-        module, handover = None, None
+        module, handover, steps = None, None, 0
         for number, (stage, done) in enumerate(zip(self.stages, finished)):
             folder = self.stage_folder(stage)
             folder.mkdir(parents=True, exist_ok=True)
@@ -122,12 +125,13 @@ class Run:
             clock = Clock(self.clock)
             with clock.running():  # a hull, a plane sweep
                 module = self._module(stage, module, handover, blank=blank)
-            module.clock = Clock(self.clock) if blank else clock
+            module.clock, module.steps_before = Clock(self.clock) if blank else clock, steps
             if done:
                 load_weights(module, folder / "last.ckpt")
                 self.tell(f"{stage.settings.name}: finished before")
             else:
                 self._fit_stage(stage, module, handover)
+            steps += int(_done(folder)["steps"])
             handover = load_handover(folder)
         return module
 
@@ -228,12 +232,14 @@ class Run:
         last = folder / "last.ckpt"
         sentinel = Sentinel(folder, skip=self.skip)
         keeper = KeepCheckpoint(last, self.checkpoint_seconds, sentinel.check)
-        trainer = self.make_trainer(folder, [sentinel, *self.callbacks(settings.name, folder), keeper])
-        checkpoint = last if last.is_file() else None
+        checkpoint, steps = last if last.is_file() else None, 0
         if checkpoint is not None:
             steps, seconds = check_state(checkpoint, module)
             fraction = module.settings.fraction(steps, seconds)
             self.tell(f"{settings.name}: goes on at {fraction:.0%}, step {steps}")
+        loggers = self.loggers.open(module.steps_before + steps)
+        callbacks = [sentinel, *self.callbacks(settings.name, folder), keeper]
+        trainer = self.make_trainer(folder, callbacks, loggers)
         reset_peak_memory()
         code = commit()  # now, as others may be made before the stage ends
         with keeper.listening():

@@ -1,0 +1,141 @@
+"""One run of every tracker for all stages of a run, with its hyperparameters and scores."""
+
+from functools import partial
+
+import lightning
+import pytest
+import torch
+from lightning.pytorch.loggers import MLFlowLogger, TensorBoardLogger, WandbLogger
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+from forewarp.files import read_json, read_rows
+from forewarp.training.callbacks import Scalars
+from forewarp.training.loggers import CsvLogger, RunLoggers, log_image
+from tests.support.tiny_scene import Interrupt, make_run, stage
+
+STEPS = 6
+PARAMETERS = {
+    "model.name": "forward",
+    "stage.fine.density": 45.0,
+    "preset.rays": "None",
+    "model.rotation": True,
+}
+SCORES = {"test/all/psnr": 30.5}
+
+
+class Note(lightning.Callback):
+    """Logs as any callback of Lightning's does."""
+
+    def on_train_batch_end(self, trainer, module, *_):
+        module.log("mine", float(module.run_step))
+
+
+def logged(folder, makers, *callbacks):
+    """Train two stages of six steps with loggers, and log the scores of the run."""
+    loggers = RunLoggers(makers, folder / "run", folder, PARAMETERS)
+    stages = [stage(name, iterations=STEPS) for name in ("coarse", "fine")]
+    own = [Scalars(every=2), *callbacks]
+    with loggers:
+        module = make_run(folder / "run", stages, callbacks=own, loggers=loggers).fit()
+        log_image(loggers.open(module.run_step), "images/last", torch.rand(8, 8, 3), module.run_step)
+        loggers.log_scores(SCORES, module.run_step)
+
+
+def interrupted_and_continued(folder, makers):
+    """The same, but killed in the second stage, two steps after its last checkpoint."""
+
+    class Crash(Interrupt):
+        def on_train_batch_end(self, trainer, module, *given):
+            if module.global_step == 2:
+                super().on_train_batch_end(trainer, module, *given)
+            if module.settings.name == "fine" and module.global_step == 4:
+                raise SystemExit
+
+    class Save(Interrupt):
+        def on_train_batch_end(self, trainer, module, *_):
+            if module.settings.name == "fine" and module.global_step == 2:
+                for callback in trainer.callbacks:
+                    if hasattr(callback, "save"):
+                        callback.save(trainer)
+
+    with pytest.raises(SystemExit):
+        logged(folder, makers, Save("fine", 2), Crash("fine", 4))
+    logged(folder, makers)
+
+
+@pytest.fixture
+def plain():
+    return {
+        "tensorboard": partial(TensorBoardLogger, name="tensorboard", version="", default_hp_metric=False),
+        "csv": partial(CsvLogger, name="csv", version=""),
+    }
+
+
+def test_stages_are_one_curve_and_a_continued_run_goes_on_in_it(tmp_path, plain):
+    interrupted_and_continued(tmp_path, plain)
+    rows = read_rows(tmp_path / "run" / "csv" / "metrics.csv")
+    steps = [int(row["step"]) for row in rows if row["train/loss"]]
+    assert steps == [2, 4, 6, 8, 10, 12]
+    assert [row["test/all/psnr"] for row in rows if row["test/all/psnr"]] == ["30.5"]
+    text = (tmp_path / "run" / "csv" / "hparams.yaml").read_text()
+    assert "stage.fine.density: 45.0" in text
+    events = EventAccumulator(str(tmp_path / "run" / "tensorboard"))
+    events.Reload()
+    assert [point.step for point in events.Scalars("train/loss")] == steps
+    assert [(point.step, point.value) for point in events.Scalars("test/all/psnr")] == [(12, 30.5)]
+    assert events.Tags()["images"] == ["images/last"]
+    (table,) = (events.SummaryMetadata("_hparams_/session_start_info").plugin_data.content,)
+    assert b"stage.fine.density" in table
+
+
+def test_what_others_log_is_on_the_axis_of_the_run(tmp_path, plain):
+    loggers = RunLoggers({"csv": plain["csv"]}, tmp_path)
+    run = make_run(tmp_path, [stage("coarse", iterations=50), stage("fine", iterations=50)], loggers=loggers)
+    run.callbacks = lambda *_: [Note()]
+    with loggers:
+        run.fit()
+    rows = [row for row in read_rows(tmp_path / "csv" / "metrics.csv") if row["mine"]]
+    assert [(int(row["step"]), float(row["mine"])) for row in rows] == [(50, 50), (100, 100)]
+
+
+@pytest.mark.filterwarnings("ignore:.*noload.*")  # SQLAlchemy's, of what MLflow calls
+def test_mlflow_has_one_run_with_parameters_curves_and_scores(tmp_path, plain):
+    mlflow = pytest.importorskip("mlflow", reason="needs forewarp[trackers]")
+    makers = {"mlflow": partial(MLFlowLogger, experiment_name="forewarp", tracking_uri=None)}
+    interrupted_and_continued(tmp_path, makers)
+    client = mlflow.MlflowClient(f"sqlite:///{tmp_path}/mlflow.db")
+    (experiment,) = client.search_experiments(filter_string="name = 'forewarp'")
+    (run,) = client.search_runs([experiment.experiment_id])
+    assert run.info.run_id == read_json(tmp_path / "run" / "loggers.json")["mlflow"]
+    assert run.info.status == "FINISHED"
+    assert run.info.run_name.endswith("/run")
+    assert run.data.params["stage.fine.density"] == "45.0"
+    assert run.data.metrics["test/all/psnr"] == 30.5
+    steps = {point.step for point in client.get_metric_history(run.info.run_id, "train/loss")}
+    assert steps == {2, 4, 6, 8, 10, 12}
+
+
+@pytest.mark.slow
+def test_wandb_has_one_run_for_a_continued_one(tmp_path, monkeypatch):
+    pytest.importorskip("wandb", reason="needs forewarp[trackers]")
+    monkeypatch.setenv("WANDB_SILENT", "true")
+    makers = {"wandb": partial(WandbLogger, project="forewarp", offline=True)}
+    interrupted_and_continued(tmp_path, makers)
+    name = read_json(tmp_path / "run" / "loggers.json")["wandb"]
+    parts = sorted(path.name for path in (tmp_path / "wandb").glob("offline-run-*"))
+    assert len(parts) == 2  # which wandb sync joins, as both are of one run
+    assert all(part.endswith(name) for part in parts)
+    assert not [path for path in (tmp_path / "run").rglob("*") if path.is_symlink()]
+
+
+def test_a_tracker_that_takes_nothing_is_named(tmp_path):
+    pytest.importorskip("mlflow", reason="needs forewarp[trackers]")
+    loggers = RunLoggers({"mlflow": partial(MLFlowLogger, tracking_uri="nowhere://x")}, tmp_path / "run")
+    with pytest.raises(ValueError, match=r"logger.mlflow: expected a tracker that takes this run, but got"):
+        loggers.open(0)
+
+
+def test_a_package_that_is_missing_is_named(tmp_path, monkeypatch):
+    monkeypatch.setattr("forewarp.training.loggers.find_spec", lambda name: None)
+    with pytest.raises(ImportError, match="expected wandb for mine, but got none; install forewarp.tr"):
+        RunLoggers({"mine": partial(WandbLogger)}, tmp_path)
