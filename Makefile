@@ -4,6 +4,7 @@
 	lint format clean
 SHELL := bash
 .SHELLFLAGS := -o pipefail -c
+unexport PYTHONDONTWRITEBYTECODE # what pytest rewrites is compiled once
 PYTHON ?= python3
 BIN := .venv/bin
 # Install forewarp with the extras that follow, from where pip is told to look.

@@ -6,6 +6,7 @@ import gc
 from forewarp.cli.entry import wait_briefly
 
 wait_briefly()  # before torch is imported
+gc.set_threshold(100_000, 20, 20)  # composing a configuration makes many objects and no garbage
 
 import pytest
 import torch

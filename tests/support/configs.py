@@ -20,8 +20,13 @@ def composed(*overrides: str, name: str = "train", hydra: bool = False) -> DictC
 
 
 @cache
+def _folder() -> str:
+    return str(configurations())
+
+
+@cache
 def _composed(overrides: tuple[str, ...], name: str, hydra: bool) -> DictConfig:
-    with initialize_config_dir(str(configurations()), version_base="1.3"):
+    with initialize_config_dir(_folder(), version_base="1.3"):
         return compose(name, list(overrides), return_hydra_config=hydra)
 
 
