@@ -8,7 +8,7 @@ from lightning import LightningModule, Trainer
 
 from forewarp.data.dnerf import read_scene
 from forewarp.data.files import SceneError, fingerprint
-from forewarp.data.module import DNeRFDataModule, SceneDataModule, hold_out, outline, with_canonical
+from forewarp.data.module import DNeRFDataModule, SceneDataModule, hold_out, only, outline, with_canonical
 from forewarp.scene.frame import Truth
 from forewarp.scene.view import Batch, Target
 from tests.support.tiny_scene import ball_scene
@@ -215,3 +215,16 @@ def test_the_canonical_time_is_one_at_which_parts_do_not_touch(apart, time):
     assert with_canonical(posing(*apart), "spread").canonical_time == time
     assert with_canonical(posing(*apart, alpha=False), "spread").canonical_time == 0.5
     assert outline(torch.zeros(4, 4, dtype=torch.bool)) == 0
+
+
+def test_few_training_views_are_spread_and_keep_the_canonical_time():
+    scene = ball_scene(frames=9, size=8)
+    few = only(scene, 3)
+    times = [frame.time for frame in few.train]
+    assert (len(times), few.canonical_time in times, few.protocol["train_views"]) == (3, True, 3)
+    assert {max(scene.times), scene.canonical_time} <= set(times)
+    assert (few.val, few.test) == (scene.val, scene.test)
+    assert only(scene, None) is only(scene, 9) is scene
+    assert len(SceneDataModule(lambda: scene, train_views=1).scene.train) == 1
+    with pytest.raises(SceneError, match="data.train_views: expected"):
+        only(scene, 0)

@@ -439,3 +439,11 @@ def test_mistakes_end_in_one_line(refused, in_tmp, arguments, line):
     write_run("several", seed=1)
     assert line in refused("report", "kind=run", "out=out", *arguments)
     assert not (in_tmp / "out").exists()
+
+
+@pytest.mark.parametrize("doubts", [["ended after 3 steps", NASTY], 7, None])
+def test_what_is_doubted_about_a_run_stands_on_its_page(tmp_path, doubts):
+    page = write(
+        told_run(tmp_path, metrics={"protocol": {"doubts": doubts}, "test": {"all": {"psnr": 20.0}}})
+    )
+    assert ("ended after 3 steps; " + NASTY in page.text) == isinstance(doubts, list)

@@ -122,3 +122,8 @@ def test_one_process_trains_a_run(devices, nodes, got):
     else:
         with pytest.raises(ValueError, match=f"trainer.devices: expected 1, .* but got {got}; one process"):
             check_trainer(trainer)
+
+
+def test_a_profiler_of_another_name_is_refused():
+    with pytest.raises(ValueError, match="trainer.profiler: expected simple, advanced or null, but got slow"):
+        build_run(config_of("+trainer.profiler=slow"))

@@ -25,6 +25,8 @@ What one types most (options such as --multirun or --config-dir=FOLDER come firs
   score=psnr|ssim|ms_ssim|...         metric that a job of --multirun returns, on views not trained on
   sentinel.skip=N                     skip up to N steps of a stage whose numbers are not finite
   run=FOLDER                          the run's folder (runs/<scene>/<model>-<preset>-seed<seed>)
+  debug=fast|overfit|profile|limit    a short run to find mistakes: a few steps of all; three views again and
+                                      again; where time goes; a part of data and budget
   effects=auto                        find out what the scene calls for, then fit that: see forewarp-plan
   plan=FILE                           fit what a plan says; an override typed beside it wins
   viewer=true                         show the run on a page while it trains: see forewarp-view
@@ -85,7 +87,8 @@ def measure(prepared, module) -> float | None:
     """Measure a fitted run, or say how to; draw its curve; return the score."""
     from forewarp.evaluation.evaluate import notes_of
     from forewarp.report.figures import draw_own
-    from forewarp.runs.fitted import doubts, log_scores, measure_run, tell
+    from forewarp.runs.build import PROFILE
+    from forewarp.runs.fitted import doubts_of, log_scores, measure_run, tell, training_psnr
 
     run, config = prepared.run, prepared.config
     if config.evaluate:
@@ -93,7 +96,14 @@ def measure(prepared, module) -> float | None:
     else:
         fitted = f"fitted: {run.folder}; measure it with forewarp-evaluate {quote(f'run={run.folder}')}"
         print(fitted, *notes_of(module.method.protocol()), sep="\n")
-        tell(doubts(run, module.to(run.device)))
+        tell(doubts_of(config, run, module.to(run.device)))
+    if config.get("debug") == "overfit":
+        reached, one_color = training_psnr(run, module.to(run.device))
+        views, steps = len(run.datamodule.scene.train), sum(done["steps"] for done in run.finished().values())
+        about = f"of {views} training images after {steps} steps; one color alone has {one_color:.2f}"
+        print(f"overfit  psnr {reached:.2f} {about}")
+    for file in sorted(run.folder.glob(f"*/*-{PROFILE}.txt")):
+        print(f"profile  {file}")
     draw_own(run.folder)
     if config.evaluate:
         at = quote(f"run={run.folder}")

@@ -56,6 +56,22 @@ def hold_out(scene: Scene, count: int) -> Scene:
     )
 
 
+def only(scene: Scene, count: int | None) -> Scene:
+    """Keep ``count`` training frames: the nearest to the canonical time, and others evenly spread; None: all.
+
+    Raises:
+        SceneError: for a number that is not whole, or below 1.
+    """
+    if count is None or whole(count, "data.train_views", 1) >= len(scene.train):
+        return scene
+    times = [frame.time for frame in scene.train]
+    first = min(range(len(times)), key=lambda i: abs(times[i] - scene.canonical_time))
+    order = sorted((i for i in range(len(times)) if i != first), key=lambda i: times[i])
+    kept = {first, *(order[i] for i in spread(len(order), count - 1))}
+    train = tuple(frame for i, frame in enumerate(scene.train) if i in kept)
+    return replace(scene, train=train, protocol={**scene.protocol, "train_views": count})
+
+
 def most_held_out(scene: Scene) -> int:
     """Count the training frames that a scene can spare."""
     return len(_spare(scene)) // 2
@@ -162,6 +178,7 @@ class SceneDataModule(LightningDataModule):
         views_per_step: training frames of one time that share a batch's rays.
         cache_bytes: most bytes of decoded images kept in the process; the last module's number counts.
         held_out: training frames that are never trained on (``hold_out``).
+        train_views: most training frames to train on, of those that are left (``only``); None: all.
         canonical: another canonical time than the format's own (None): see ``with_canonical``.
         place: the scene's folder, where it has one.
     """
@@ -185,19 +202,21 @@ class SceneDataModule(LightningDataModule):
         views_per_step: int = 1,
         cache_bytes: int = 1_500_000_000,
         held_out: int = 0,
+        train_views: int | None = None,
         canonical: str | float | None = None,
         place: str | Path | None = None,
     ) -> None:
         super().__init__()
         self.place = None if place is None else Path(place)
         self._read, self.cache_bytes, self.held_out = read, cache_bytes, held_out
-        self._canonical, self._eval_background = canonical, eval_background
+        self._canonical, self._eval_background, self._train_views = canonical, eval_background, train_views
         self._draw = {"rays": rays, "background": background, "seed": seed, "views_per_step": views_per_step}
 
     @cached_property
     def scene(self) -> Scene:
         """The scene; its protocol names the background that it is measured on."""
         scene = hold_out(with_canonical(self._read(), self._canonical), self.held_out)
+        scene = only(scene, self._train_views)
         check_seen(scene)
         protocol = {**scene.protocol, "background": self._background(scene) if scene.has_alpha else "none"}
         if self.place is not None and any((p / RECORD).is_file() for p in (self.place, self.place.parent)):

@@ -10,6 +10,7 @@ from pathlib import Path
 import torch
 from hydra.errors import HydraException
 from hydra.utils import get_object, instantiate
+from lightning.pytorch.profilers import AdvancedProfiler, SimpleProfiler
 from omegaconf import DictConfig, OmegaConf
 
 from forewarp.clock import Clock
@@ -18,6 +19,9 @@ from forewarp.training.callbacks import StageProgress
 from forewarp.training.loggers import RunLoggers
 from forewarp.training.schedule import StagePlan, seconds_after, share_out
 from forewarp.training.stages import Run
+
+PROFILERS = {"simple": SimpleProfiler, "advanced": AdvancedProfiler}  # Lightning's
+PROFILE = "profile"  # of a file's name: fit-profile.txt
 
 
 def build_run(config: DictConfig) -> Run:
@@ -36,6 +40,7 @@ def build_run(config: DictConfig) -> Run:
     plans = {name: stage_of(name, stage) for name, stage in config.stage.items()}
     factories = [make for make in instantiate(config.callbacks, _convert_="all").values() if make is not None]
     trainer = instantiate(config.trainer, _convert_="all")
+    profiler = profiler_of(config.trainer.get("profiler"))
 
     def make_trainer(folder: Path, callbacks: list, loggers: list):
         return trainer(
@@ -46,6 +51,7 @@ def build_run(config: DictConfig) -> Run:
             callbacks=callbacks,
             logger=loggers,
             default_root_dir=str(folder),
+            profiler=profiler and profiler(dirpath=str(folder), filename=PROFILE),
             enable_checkpointing=False,
             enable_progress_bar=False,
             enable_model_summary=False,
@@ -148,6 +154,17 @@ def stage_of(name: str, config: DictConfig | None) -> StagePlan | None:
     plan = instantiate(content, _convert_="all")
     plan.model = None if own is None else model_of(OmegaConf.create(own))
     return plan
+
+
+def profiler_of(name: str | None) -> Callable | None:
+    """Return what makes the profiler of a stage, which writes a table of calls into the stage's folder.
+
+    Raises:
+        ValueError: for a name that is none of ``PROFILERS``.
+    """
+    if name is not None and name not in PROFILERS:
+        raise ValueError(f"trainer.profiler: expected simple, advanced or null, but got {name}")
+    return PROFILERS.get(name)
 
 
 def check_trainer(trainer: DictConfig) -> None:

@@ -300,7 +300,7 @@ def measure_run(run: Run, module: DynamicSceneModule, config: DictConfig) -> dic
     options = {"sheets": config.sheets, "views": config.get("views"), "reduce": config.get("reduce")}
     options |= {"protocol": protocol, "finished": run.finished()}
     module = module.to(run.device)
-    if lines := doubts(run, module):
+    if lines := doubts_of(config, run, module):
         protocol["doubts"] = lines
     with Counted("test views") as progress:
         metrics = evaluate(module, data, folder, suite, progress=progress, **options)
@@ -453,10 +453,15 @@ class TellBest(Callback):
             print(f"written: {file}", flush=True)
 
 
-FEW = 10  # steps of a stage, or fewer, that can hardly have changed anything
+FEW = 50  # steps of a stage that can hardly have learned anything, if there were fewer
 SHORT = 1000  # steps of a run, or fewer, that may be all that is wrong with it
 LOW, ABOVE = 21.0, 5.0  # dB; a fit is in doubt below LOW, or less than ABOVE better than one colour
 _VIEWS, _PIXELS = 8, 2000  # training images that are looked at, and pixels of each
+
+
+def doubts_of(config: DictConfig, run: Run, module: DynamicSceneModule) -> list[str]:
+    """Return the ``doubts`` about a run; none of one for debugging, which is too short to be good."""
+    return [] if config.get("debug") else doubts(run, module)
 
 
 def doubts(run: Run, module: DynamicSceneModule) -> list[str]:
@@ -474,8 +479,9 @@ def doubts(run: Run, module: DynamicSceneModule) -> list[str]:
         steps, seconds = made[name]["steps"], made[name]["seconds"]
         if steps < min(FEW, most or FEW):
             lines.append(
-                f"stage.{name} ended after {steps} steps in {seconds:.1f} s; raise budget.minutes, give it "
-                f"more of them (stage.{name}.share), or leave it out (~stage.{name})"
+                f"stage.{name} ended after {steps} step{'s' * (steps != 1)} in {seconds:.1f} s, too few to "
+                f"learn; raise budget.minutes, give it more of them (stage.{name}.share), take "
+                f"preset=demo, whose steps are smaller, or leave it out (~stage.{name})"
             )
     in_play = max(noted.get("frames_in_play", len(scene.train)) for noted in made.values())
     if in_play < len(scene.train) and run.stages[-1].settings.curriculum.get("most") is None:

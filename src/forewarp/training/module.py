@@ -82,17 +82,23 @@ class DynamicSceneModule(lightning.LightningModule):
 
         Optimisation is manual, as a method may compute its gradients itself.
         """
-        optimizer = self.optimizers()
+        optimizer, profiled = (
+            self.optimizers(),
+            self.trainer.profiler.profile,
+        )  # debug=profile shows these parts
         for group in optimizer.param_groups:
             for parameter in group["params"]:
                 parameter.grad = None
-        loss, gradients = self.loss_of(batch)
+        with profiled("method.look and loss terms"):
+            loss, gradients = self.loss_of(batch)
         with torch.autocast(self.device.type, enabled=False):  # mixed precision is of the forward pass alone
-            if gradients is None:
-                self.manual_backward(loss)
-            else:
-                set_gradients(self.method, gradients)
-            optimizer.step()
+            with profiled("gradients"):
+                if gradients is None:
+                    self.manual_backward(loss)
+                else:
+                    set_gradients(self.method, gradients)
+            with profiled("optimizer.step"):
+                optimizer.step()
         return loss.detach()
 
     def loss_of(self, batch: Batch) -> tuple[Tensor, Mapping[str, Tensor] | None]:
