@@ -14,13 +14,14 @@ if TYPE_CHECKING:
 __all__ = ["Camera", "load", "look_at", "orbit"]
 
 
-def load(run, *, trust=(), device="cpu"):
+def load(run, *, trust=(), device="cpu", data_root=None):
     """Open a fitted run, to render it, follow its points and read its numbers; or a ``scene.glb``.
 
     Args:
         run: the run's folder, or the file that ``forewarp-export format=glb`` wrote.
         trust: packages whose code the run's config may name, beside forewarp; nothing else is imported.
         device: where to compute: ``cpu`` or ``cuda``.
+        data_root: the folder that holds the scene's folder, where the data have moved since.
 
     Returns:
         a ``forewarp.runs.fitted.Fitted``; of a file, a ``SceneFile``.
@@ -31,7 +32,7 @@ def load(run, *, trust=(), device="cpu"):
     """
     from forewarp.runs.fitted import open_run
 
-    return open_run(run, trust=trust, device=device)
+    return open_run(run, trust=trust, device=device, data_root=data_root)
 
 
 def __getattr__(name: str):

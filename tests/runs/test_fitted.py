@@ -79,6 +79,18 @@ def test_a_frame_is_rendered_as_it_is_measured(fitted, tmp_path, behind):
     torch.testing.assert_close((over[0] - over[1])[unclipped], clear.expand(-1, -1, 3)[unclipped])
 
 
+def test_data_that_moved_are_named(fitted, tmp_path, monkeypatch):
+    run = shutil.copytree(fitted, tmp_path / "run")
+    shutil.copytree(fitted.parent / "scenes", tmp_path / "there")
+    config = OmegaConf.load(run / "config.yaml")
+    config.data.root = "nowhere"
+    OmegaConf.save(config, run / "config.yaml")
+    with pytest.raises(ValueError, match="nowhere"):
+        load(run)
+    monkeypatch.setenv("HOME", str(tmp_path))
+    assert len(load("~/run", data_root=tmp_path / "there").cameras) == 6
+
+
 def test_poses_and_points_may_be_arrays_and_lists(fitted):
     scene = load(fitted)
     camera, point = scene.cameras[0], [[0.0, 0.1, 0.2]]
@@ -98,7 +110,7 @@ def test_poses_and_points_may_be_arrays_and_lists(fitted):
         (lambda scene: scene.render(scene.cameras[0]), "time: expected a number in [0, 1], but got None"),
         (
             lambda scene: scene.render(np.eye(3), 0),
-            "camera_to_world: expected finite numbers (4, 4), but got (3, 3)",
+            "no camera: expected finite numbers (4, 4), but got (3, 3)",
         ),
         (
             lambda scene: scene.render(np.diag([2, 2, 2, 1]), 0),
@@ -113,6 +125,16 @@ def test_poses_and_points_may_be_arrays_and_lists(fitted):
             "points: expected finite numbers (N, 3), but got (3,)",
         ),
         (lambda scene: scene.trajectories([[0, 0, np.nan]], [0]), "points: expected finite numbers (N, 3)"),
+        (
+            lambda scene: scene.trajectories([[0, 0, 0]], [2]),
+            "times: expected numbers in [0, 1], but got [2.0]",
+        ),
+        (
+            lambda scene: scene.render(scene.cameras[0], [0.5]),
+            "time: expected a number in [0, 1], but got [0.5]",
+        ),
+        (lambda scene: forewarp.look_at([1, 2, 3], [1, 2, 3], [0, 0, 1]), "target: expected another place"),
+        (lambda scene: load(scene.folder, device="gpu"), "device: expected cpu"),
         (lambda scene: scene.frames("tests"), "split: expected one of train, val, test, held"),
     ],
 )

@@ -10,6 +10,7 @@ from pathlib import Path
 from statistics import fmean
 from typing import ClassVar
 
+import numpy as np
 import torch
 from hydra.core.hydra_config import HydraConfig
 from hydra.experimental.callback import Callback
@@ -104,7 +105,7 @@ class Renderable:
         if not isinstance(camera, Camera):
             camera = replace(self.cameras[0], camera_to_world=_rigid(camera))
         time = frame.time if time is None and frame is not None else time
-        if time is None or not 0 <= time <= 1:
+        if np.ndim(time) or time is None or not 0 <= time <= 1:
             raise ValueError(f"time: expected a number in [0, 1], but got {time}")
         behind = self.background if background is None else _color(background)
         moment = Moment(float(time), camera=None if frame is None else frame.camera_id)
@@ -121,6 +122,8 @@ class Renderable:
         """
         method = self._able(HasTrajectories, "follows points")
         points, times = tensor_of("points", points, None, 3), tensor_of("times", times, None)
+        if not all(0 <= time <= 1 for time in times.tolist()):
+            raise ValueError(f"times: expected numbers in [0, 1], but got {times.tolist()}")
         with torch.no_grad():
             return method.trajectories(*(given.float().to(method.device) for given in (points, times))).cpu()
 
@@ -137,13 +140,13 @@ class Renderable:
 
 def _rigid(given: Vector) -> Tensor:
     """Make a pose (4, 4) of what a user gives; refuse what is none."""
-    pose = tensor_of("camera_to_world", given, 4, 4)
+    pose = tensor_of("view, as it is no frame and no camera", given, 4, 4)
     turn, last = pose[:3, :3], pose[3].tolist()
     error, volume = float((turn.T @ turn - torch.eye(3)).abs().max()), float(torch.linalg.det(turn))
     if error > _ROUGH or volume < 0 or last != [0, 0, 0, 1]:
         expected = "a rotation (no scale, no mirror) and a place, above 0 0 0 1"
         got = f"a 3x3 of determinant {volume:.4g} above {last}; forewarp.look_at makes poses"
-        raise ValueError(f"camera_to_world: expected {expected}, but got {got}")
+        raise ValueError(f"view: expected a pose of {expected}, but got {got}")
     return pose
 
 
@@ -279,14 +282,26 @@ def opened(config: DictConfig, device: str | torch.device | None = None) -> tupl
     return run, module.eval()
 
 
-def open_run(run: str | Path, *, trust: Sequence[str] | str = (), device: str = "cpu") -> Fitted | SceneFile:
+def open_run(
+    run: str | Path,
+    *,
+    trust: Sequence[str] | str = (),
+    device: str = "cpu",
+    data_root: str | Path | None = None,
+) -> Fitted | SceneFile:
     """Load a finished run from its folder, or a scene from a file; see ``forewarp.load``."""
-    if Path(run).suffix == ".glb" or Path(run).is_file():
-        return open_file(Path(run), device)
-    config = saved_config(str(run), OmegaConf.create({"trust": list(trust_of(trust))}))
+    if device != "cpu" and not (str(device).startswith("cuda") and torch.cuda.is_available()):
+        devices = "cpu" + " or cuda" * torch.cuda.is_available()
+        raise ValueError(f"device: expected {devices}, which torch finds here, but got '{device}'")
+    run = Path(run).expanduser()
+    if run.suffix == ".glb" or run.is_file():
+        return open_file(run, device)
+    root = None if data_root is None else str(data_root)
+    changes = {"trust": list(trust_of(trust)), "data": {"root": root}}
+    config = saved_config(str(run), OmegaConf.create(changes))
     made, module = opened(config, device)
     data = made.datamodule
-    return Fitted(Path(run), config, module, data.scene, data.targets("test").background)
+    return Fitted(run, config, module, data.scene, data.targets("test").background)
 
 
 def measure_run(run: Run, module: DynamicSceneModule, config: DictConfig) -> dict:

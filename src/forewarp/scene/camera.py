@@ -207,10 +207,15 @@ def look_at(center: Vector, target: Vector, up: Vector) -> Tensor:
 
     All are (3,): tensors, arrays, lists. A camera that looks along ``up`` gets any horizontal axis.
 
+    Raises:
+        ValueError: for anything else, and for a target where the camera is.
+
     >>> look_at([0, -4, 0], [0, 0, 0], up=[0, 0, 1])[:3, 2].tolist()  # which way it looks
     [0.0, 1.0, 0.0]
     """
     center, target, up = (tensor_of(*v, 3) for v in (("center", center), ("target", target), ("up", up)))
+    if torch.equal(center, target):
+        raise ValueError(f"target: expected another place than the camera's, but got {target.tolist()}")
     forward = torch.nn.functional.normalize(target - center, dim=0)
     right = torch.linalg.cross(forward, up)
     if right.norm() < 1e-6:
