@@ -32,7 +32,7 @@ class Note(lightning.Callback):
 
 def logged(folder, makers, *callbacks):
     """Train two stages of six steps with loggers, and log the scores of the run."""
-    loggers = RunLoggers(makers, folder / "run", folder, PARAMETERS)
+    loggers = RunLoggers(makers, folder / "run", folder, lambda: PARAMETERS)
     stages = [stage(name, iterations=STEPS) for name in ("coarse", "fine")]
     own = [Scalars(every=2), *callbacks]
     with loggers:

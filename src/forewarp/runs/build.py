@@ -100,7 +100,7 @@ def loggers_of(config: DictConfig) -> RunLoggers:
         )
     makers = instantiate(named, _convert_="all")
     runs = OmegaConf.select(config, "paths.runs") or Path(config.run).parent
-    return RunLoggers(makers, Path(config.run), Path(runs), hyperparameters(config) if makers else {})
+    return RunLoggers(makers, Path(config.run), Path(runs), partial(hyperparameters, config))
 
 
 def hyperparameters(config: DictConfig) -> dict[str, object]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import os
 from collections.abc import Callable, Mapping, Sequence
+from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -57,7 +58,7 @@ class RunLoggers:
         makers: for each name a logger that waits for where it writes.
         folder: the run's folder.
         runs: the folder of all runs, where trackers that hold many of them write.
-        hyperparameters: by flat name.
+        hyperparameters: gives them by flat name, when something is first logged.
 
     As a context manager it closes them, as failed after an exception.
     """
@@ -67,10 +68,10 @@ class RunLoggers:
         makers: Mapping[str, Callable[..., Logger]] = {},
         folder: Path = Path("."),
         runs: Path = Path("."),
-        hyperparameters: Mapping[str, object] = {},
+        hyperparameters: Callable[[], Mapping[str, object]] = dict,
     ) -> None:
         self.makers, self.folder, self.runs = dict(makers), Path(folder), Path(runs)
-        self.hyperparameters = dict(hyperparameters)
+        self.hyperparameters = cache(hyperparameters)
         self._open: dict[str, Logger] | None = None
         self._closing: list[Callable[[str], None]] = []
         for name, maker in self.makers.items():
@@ -124,7 +125,7 @@ class RunLoggers:
         if kind in _PACKAGES:
             ids[name] = str(logger.version)
         if not (known and kind is MLFlowLogger):  # which takes each parameter once
-            logger.log_hyperparams(self.hyperparameters)
+            logger.log_hyperparams(dict(self.hyperparameters()))
         self._closing.append(logger.finalize)
         logger.finalize = lambda status: logger.save()  # Lightning calls it after each stage
         return logger
@@ -133,7 +134,7 @@ class RunLoggers:
         """Log the scores of a measured run, in TensorBoard beside its hyperparameters (HPARAMS)."""
         for logger in self.open(step):
             if isinstance(logger, TensorBoardLogger):
-                logger.log_hyperparams(self.hyperparameters, dict(scores), step)
+                logger.log_hyperparams(dict(self.hyperparameters()), dict(scores), step)
             else:
                 logger.log_metrics(dict(scores), step)
             logger.save()
