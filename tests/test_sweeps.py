@@ -2,15 +2,19 @@
 
 import shlex
 from copy import deepcopy
+from itertools import chain
+from unittest.mock import patch
 
 import pytest
 import yaml
 from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
+from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 
 from forewarp.runs.build import build_run
 from forewarp.runs.config import hashed
+from forewarp.runs.overrides import key_of, merged
 from hydra_plugins.forewarp_one_at_a_time import changed
 from tests.support.configs import ROOT, composed
 
@@ -37,14 +41,15 @@ def jobs_of(sweep, *words):
 
 def job_of(sweep, *overrides):
     """A job's config, put together as far as it goes without its data."""
-    config = composed(f"sweeps={sweep}", *overrides)
-    build_run(config)
+    config = composed(f"sweeps={sweep}", *overrides, hydra=True)
+    with patch.object(HydraConfig.instance(), "cfg", config):  # which names what was typed
+        build_run(config)
     return config
 
 
-def some_of(jobs):
-    """Jobs that have, together, every override that occurs."""
-    seen, kept = set(), []
+def some_of(jobs, seen):
+    """Jobs that have, together, every override that occurs and was not seen before."""
+    kept = []
     for job in jobs[::-1]:
         if not seen.issuperset(job):
             seen |= {*job}
@@ -67,10 +72,11 @@ def test_a_sweep_has_its_jobs(sweep, count):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("sweep", [*PAPER, "effects"])
-def test_every_scene_and_choice_composes_and_has_a_folder_of_its_own(sweep):
-    jobs = some_of(jobs_of(sweep))
-    assert len({hashed(job_of(sweep, *job)).run for job in jobs}) == len(jobs)
+def test_every_scene_and_choice_composes_and_has_a_folder_of_its_own():
+    seen = set()
+    for sweep in (*PAPER, "effects"):
+        jobs = some_of(jobs_of(sweep), seen)
+        assert len({hashed(job_of(sweep, *job)).run for job in jobs}) == len(jobs), sweep
 
 
 @pytest.mark.slow
@@ -109,10 +115,9 @@ def test_a_typed_scene_takes_the_place_of_those_of_a_sweep(ok, in_tmp):
         ]
 
 
-@pytest.mark.parametrize("every", [40, pytest.param(1, marks=pytest.mark.slow)], ids=["some", "all"])
 @pytest.mark.parametrize("method", CHANGES)
-def test_every_change_composes_and_has_a_folder_of_its_own(method, every):
-    common, changes = ["experiment=dnerf", "data.scene=x"], CHANGES[method][::every]
+def test_changes_compose_and_have_folders_of_their_own(method):
+    common, changes = ["experiment=dnerf", "data.scene=x"], CHANGES[method][::40]
     found = changed(jobs_of(f"price_list_{method}"), changes)
     jobs = [
         job_of(f"price_list_{method}", *common, *(word for part in job for word in shlex.split(part)))
@@ -121,6 +126,39 @@ def test_every_change_composes_and_has_a_folder_of_its_own(method, every):
     assert len({hashed(job).run for job in jobs}) == len(changes)
     assert {(job.budget.minutes, job.data.held_out) for job in jobs} == {(3, 8)}
     assert jobs[0].model.name == method
+
+
+def together(changes):
+    """Group changes, each a list of words, so that those of a group set no key to two values.
+
+    Of whole options each stays alone.
+    """
+    groups = []
+    for words in map(shlex.split, changes):
+        whole = any(key_of(word) in ("model", "preset", "stage.coarse") for word in words)
+        values = {key_of(word): word for word in words}
+        for group, known in groups:
+            if not whole and known and all(known.get(key, word) == word for key, word in values.items()):
+                group.append(words)
+                known |= values
+                break
+        else:
+            groups.append(([words], {} if whole else values))
+    return [group for group, _ in groups]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", CHANGES)
+def test_every_change_composes_and_changes_something(method):
+    sweep = f"price_list_{method}"
+    (job,) = jobs_of(sweep)
+    base = job_of(sweep, *HOOK, *job)
+    for group in together(CHANGES[method][1:]):
+        config = job_of(sweep, *HOOK, *merged(job, list(dict.fromkeys(chain(*group)))))
+        for words in group:
+            keys = [key_of(word) for word in words]
+            changed_keys = [k for k in keys if OmegaConf.select(config, k) != OmegaConf.select(base, k)]
+            assert changed_keys or any("." not in key for key in keys), words
 
 
 @pytest.mark.parametrize(("method", "count"), COUNTS.items())

@@ -61,6 +61,6 @@ def test_the_mask_of_what_moves_is_that_of_the_scene_itself(ok, tmp_path):
         "sheets=0",
         "seed=0",
     ]
-    budget = ["budget.minutes=null", "budget.iterations=6000", "trainer=cpu", "threads=1"]
+    budget = ["budget.minutes=null", "budget.iterations=2000", "trainer=cpu", "threads=1"]
     ok("train", "scene=specimen_rigid", "model=particles", *words, *budget, f"run={tmp_path}/run")
-    assert score(tmp_path / "run") >= 0.9
+    assert score(tmp_path / "run") >= 0.86
