@@ -1,16 +1,19 @@
 """``--multirun``: sweeps, a search by Optuna, and jobs that are killed or fail under every launcher."""
 
 import json
+import re
 import signal
 import subprocess
 import sys
 import time
 from importlib.util import find_spec
+from pathlib import Path
 
 import psutil
 import pytest
 import yaml
 
+from forewarp.files import read_rows
 from forewarp.synth.scenes import synthesize
 from tests.support.configs import ROOT
 
@@ -40,6 +43,22 @@ def test_seeds_repeat_a_job_and_nothing_else(ok, refused, in_tmp):
     assert "absent: expected refuse or skip, but got maybe" in refused("train", *scene, "absent=maybe")
     line = "seeds: expected --multirun beside seeds=3; add it, or use seed=N"
     assert refused("train", *scene, "seeds=3") == line
+
+
+@pytest.mark.slow
+def test_a_sweep_without_a_name_has_a_folder_and_a_row_of_scores_for_each_job(ok, in_tmp):
+    write(in_tmp / "vehicle")
+    scene = ["data=dnerf", "data.root=.", "data.scene=vehicle", "model=forward", "data.rays=64"]
+    tiny = ["budget.iterations=4", "stage.coarse.num_voxels=[[0,800]]", "~stage.fine", "logger=csv"]
+    words = ["train", "--multirun", *SHORT, *scene, *tiny, "stage.coarse.lr.density=0.1,0.2"]
+    ok(*words)
+    folders = sorted(Path("runs/vehicle").iterdir())
+    for folder, rate in zip(folders, ("0.1", "0.2"), strict=True):
+        assert re.fullmatch(rf"forward-demo-seed0-density-{rate}-\w{{10}}", folder.name)
+        rows = read_rows(folder / "csv" / "metrics.csv")
+        assert float(rows[-1]["test/space/psnr"]) > 0
+        assert f"stage.coarse.lr.density: {rate}" in (folder / "csv" / "hparams.yaml").read_text()
+    assert ok(*words).out.count("measured before: ") == 2
 
 
 @pytest.mark.slow

@@ -16,8 +16,9 @@ from importlib.metadata import version
 from pathlib import Path
 
 from forewarp.cli.mistakes import flat, one_line, refuse_dashes, unknown_key, with_run_key
+from forewarp.runs import overrides
 from forewarp.runs.config_files import configurations, installed, project_root
-from forewarp.runs.overrides import as_text, typed_overrides
+from forewarp.runs.overrides import as_text, is_sweep, key_of, typed_overrides
 
 TRACEBACK_VARIABLE = "FOREWARP_TRACEBACK"
 MISTAKE, INTERRUPTED = 2, 130
@@ -130,6 +131,7 @@ def _run(name: str, task: Callable, conf: Path, config_name: str) -> list[int]:
 
     # Travels with the job, as a launcher may not pass the environment on.
     trust = {TRUST_VARIABLE: os.environ[TRUST_VARIABLE]} if TRUST_VARIABLE in os.environ else {}
+    typed_once = {key_of(word) for word in sys.argv[1:] if word[0] != "-" and not is_sweep(word)}
 
     def job(config) -> object:
         # Caught here, as Hydra would print a message of its own.
@@ -137,6 +139,7 @@ def _run(name: str, task: Callable, conf: Path, config_name: str) -> list[int]:
         try:
             quiet()  # again, as a launcher may start another process
             os.environ.update(trust)
+            overrides.constant.update(typed_once)
             result = task(config)
         except Exception as error:
             status = _tell(name, error, config_name)
@@ -152,9 +155,9 @@ def _run(name: str, task: Callable, conf: Path, config_name: str) -> list[int]:
         finally:  # a sweeper may fail, too
             lines = Path(ended).read_text().splitlines() if os.path.exists(ended) else []
             jobs = [line.split(" ", 1) for line in lines]
-            failed = [overrides for status, overrides in jobs if int(status)]
+            failed = [words for status, words in jobs if int(status)]
             if failed and len(jobs) > 1:
-                listed = "".join(f"\n  {overrides}" for overrides in failed)
+                listed = "".join(f"\n  {words}" for words in failed)
                 print(f"forewarp-{name}: {len(failed)} of {len(jobs)} jobs failed:{listed}", file=sys.stderr)
     return [int(status) for status, _ in jobs]
 

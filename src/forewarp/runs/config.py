@@ -26,7 +26,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from forewarp.data.files import RECORD
 from forewarp.files import MOST_CONFIG, read_text, refuse_links
-from forewarp.runs.overrides import key_of, typed_overrides
+from forewarp.runs.overrides import constant, key_of, typed_overrides
 
 # Two runs differ if these keys differ; device, folder and what is shown do not count.
 IDENTITY = ("data", "model", "objective", "stage", "preset", "budget", "seed")
@@ -90,11 +90,12 @@ def hashed(config: DictConfig) -> DictConfig:
 
     So each configuration has a folder of its own, and a finished job is found again. A precision other than
     32-true counts too, and for a run bounded by minutes the device and the number of threads. Before the
-    digits of a job of a sweep stands what was typed for it; so do they where a sweep names no folders.
+    digits of a job of a sweep stands what tells it apart; so do they where a sweep names no folders.
     """
     typed = typed_overrides() if HydraConfig.initialized() else []
     swept = bool(typed) and HydraConfig.get().mode == RunMode.MULTIRUN
-    words, run = in_words(typed) if swept else "", str(config.run)
+    words = in_words([word for word in typed if key_of(word) not in constant]) if swept else ""
+    run = str(config.run)
     if words and HASH not in run and "run" not in map(key_of, typed):
         run += f"-{HASH}"
     if HASH in run:
@@ -111,7 +112,7 @@ def instead_of(trainer: str) -> str:
 
 
 def in_words(overrides: Sequence[str]) -> str:
-    """Name a job of a sweep by what was typed for it, but for what its folder's name says by itself.
+    """Name a job of a sweep by its overrides, but for what its folder's name says by itself.
 
     >>> in_words(["model=forward", "stage.fine.lr.means=1e-3", "model/view_dependence=sh", "~stage.coarse"])
     'means-1e-3-view_dependence-sh-without-coarse'

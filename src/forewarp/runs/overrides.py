@@ -14,6 +14,7 @@ TEXTS = re.compile(
     "lpips_weights"
 )
 LISTS = ("runs", "published", "lpips_weights")
+constant: set[str] = set()  # keys that were typed with one value, which tell no jobs of a sweep apart
 OF_A_SWEEP = ("sweeps=", "seeds=", "launcher=")  # these say how jobs are run, not what a job computes
 
 
@@ -61,7 +62,7 @@ def as_text(arguments: Sequence[str]) -> list[str]:
         key, _, value = argument.partition("=")
         name = key_of(argument)
         typed = TEXTS.fullmatch(name) and value and not _is_of_hydra(name, value)
-        several = typed and (swept or name == "data.scene") and _is_sweep(argument)
+        several = typed and (swept or name == "data.scene") and is_sweep(argument)
         if typed and name != "data.scene" and value.startswith("~/"):
             value = os.path.expanduser(value)
         found.append(text_override(key, value) if typed and not several else argument)
@@ -75,7 +76,7 @@ def _is_of_hydra(key: str, value: str) -> bool:
     return is_quoted or is_null or is_list or value.startswith("${")
 
 
-def _is_sweep(override: str) -> bool:
+def is_sweep(override: str) -> bool:
     """Tell whether Hydra takes an override for several values, as ``data.scene=hook,lego``."""
     from hydra.core.override_parser.overrides_parser import OverridesParser
     from hydra.errors import HydraException
