@@ -455,11 +455,11 @@ def test_it_learns_what_moves(kind, tmp_path):
 
 FIELD = {"width": 48, "layers": 3, "skip": None, "position_frequencies": 4, "direction_frequencies": 1}
 BEND = {"warp_width": 32, "warp_layers": 3, "warp_skip": None, "warp_frequencies": 3}
-OF_THE_NICHE = {
-    "tnerf": partial(TNeRF, **FIELD, time_frequencies=2),
-    "hypernerf": partial(HyperNeRF, **FIELD, **BEND, slice_width=32),
-    "dnerf": partial(DNeRF, **FIELD, time_frequencies=2),
-    "nerfies": partial(Nerfies, **FIELD, **BEND, elastic_samples=64),
+OF_THE_NICHE = {  # with the steps that it takes to tell the two of a pair apart
+    "tnerf": (partial(TNeRF, **FIELD, time_frequencies=2), 1000),
+    "hypernerf": (partial(HyperNeRF, **FIELD, **BEND, slice_width=32), 500),
+    "dnerf": (partial(DNeRF, **FIELD, time_frequencies=2), 1000),
+    "nerfies": (partial(Nerfies, **FIELD, **BEND, elastic_samples=64), 500),
 }
 
 
@@ -467,8 +467,8 @@ OF_THE_NICHE = {
 def test_fields_that_know_the_time_show_what_appears_better_than_bent_ones(tmp_path):
     """Each beside the one that it adds the time, or its slice, to."""
     psnr, rates = {}, {"lr": {"network": 3e-3}, "lr_final_factor": 0.1}
-    settings = StageSettings.of("fine", iterations=1500, curriculum={"all_in": 0.0}, **rates)
-    for kind, model in OF_THE_NICHE.items():
+    for kind, (model, steps) in OF_THE_NICHE.items():
+        settings = StageSettings.of("fine", iterations=steps, curriculum={"all_in": 0.0}, **rates)
         weights = {"photo": 1.0} | ({"elastic": 1e-3} if kind == "nerfies" else {})
         data = SceneDataModule(niche_scene, rays=128, seed=2)
         model = partial(model, sampling=Sampling(16, 0, density="softplus", open_end=False))
