@@ -48,7 +48,7 @@ ONLY_IN = {
     **{"trimesh": {"synth"}, "embreex": {"synth"}, "torchvision": set()},
     **{"pycolmap": {"capture"}, "cv2": {"capture"}},
     **{"skimage": {"export"}, "viser": {"export", "viewer", "cli"}},
-    **{"imageio": {"drawing", "evaluation", "cli"}, "imageio_ffmpeg": {"drawing", "capture", "cli"}},
+    **{"imageio": {"drawing", "evaluation", "cli"}, "imageio_ffmpeg": {"drawing", "data", "cli"}},
     "rich": {"progress", "training", "evaluation", "planning", "cli"},
 }
 CONTRACT = {

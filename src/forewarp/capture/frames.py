@@ -8,14 +8,11 @@ from __future__ import annotations
 import math
 import re
 import shutil
-import subprocess
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from threading import Thread
 
 import cv2
-import imageio_ffmpeg
 import numpy as np
 import torch
 from torch.nn.functional import adaptive_max_pool2d, interpolate
@@ -23,6 +20,7 @@ from torch.nn.functional import adaptive_max_pool2d, interpolate
 from forewarp.data.files import UNREAD
 from forewarp.data.images import SUFFIXES, bright, common_header, in_order, read_image, write_image
 from forewarp.data.transforms import times_of
+from forewarp.data.video import HDR, Log, decode, deinterlacing, extracted, hdr_of, hdr_unsaid
 from forewarp.drawing.images import at_most
 from forewarp.files import read_json, write_json
 
@@ -41,25 +39,7 @@ _FLAT = 1e-9  # mean square of a second difference below which an image has no e
 _BLACK, _LIT = 24, 60  # of 255: in a bar at most, black of limited range and noise; beside it at least
 _EVEN, _LEAST_BAR = 2, 0.02  # pixels of 640 by which bars at both sides may differ; least share of the side
 _WHOLE = 0.9  # share of its duration after which a video counts as whole
-_STAMP = re.compile(r"Parsed_showinfo.* n: *\d+ .* pts_time:(\S+)")
-_DURATION = re.compile(r"Duration: (\d+):(\d+):([\d.]+)")
 _DAMAGE = re.compile("partial file|ended prematurely|corrupt")
-_HDR = {"arib-std-b67": "HLG", "smpte2084": "PQ"}
-_TRANSFER = re.compile(r"Video: .*\b(" + "|".join(_HDR) + r")\b")
-# Of more than 8 bits, with matrix/primaries/transfer of which one of the first is BT.2020's, the last none.
-_UNSAID = re.compile(
-    r"Video: .*p0?1[0-6](?:le|be)?\((?:[^)]*, ?)?(?:bt2020\w*/[\w-]+|[\w-]+/bt2020)/(?:unknown|reserved)\b"
-)
-# The tags of a stream, and its size; a matrix of colours stands first in its tag.
-_TAGS = re.compile(r"Video: [^,]*, \w+(?:\(([^)]*)\))?, (\d+)x(\d+)")
-_MATRIX = re.compile(r"\b(?<!/)(bt|smpte|fcc|gbr|ycg|ictcp)")
-_INTERLACED = re.compile(r"Video: .*\b(top|bottom) (coded )?first\b")
-_SD = 1024, 576  # pixels of the longer and the shorter side, at most
-# 203 cd/m2 are the white of SDR (BT.2408); below 0.8 of it colours stay, above they are compressed.
-_TO_SDR = (
-    "zscale=tin={0}:pin=bt2020:min=bt2020nc:t=linear:npl=203:agamma=false,format=gbrpf32le,zscale=p=bt709,"
-    "tonemap=mobius:param=0.8:peak=4.9:desat=0,zscale=t=bt709:m=bt709:r=pc"
-)
 
 
 @dataclass(frozen=True)
@@ -173,8 +153,8 @@ def _from_video(
         told += "it as HLG (ffmpeg -i IN -c copy -color_trc arib-std-b67 OUT.mp4) or PQ (smpte2084)"
         assumed = f"{assumed}; {told}" if assumed else told
     transfer = hdr_of(video)
-    changed = [f"{_HDR[transfer]}, tone-mapped to SDR"] if transfer else []
-    changed += ["interlaced, made whole"] if _whole(video) else []
+    changed = [f"{HDR[transfer]}, tone-mapped to SDR"] if transfer else []
+    changed += ["interlaced, made whole"] if deinterlacing(video) else []
     title = "taking frames" + (f" ({'; '.join(changed)})" if changed else "")
     with step(title) as progress:
         for index, pixels in zip(chosen, extracted(video, chosen, size, threads, bars)):
@@ -491,11 +471,11 @@ def measure(video: Path, progress: Progress, threads: int | None = None) -> tupl
 
     **Cost** one decoding, and about 13 ms a frame.
     """
-    sharp, widths, speeds, are_new, before, log = [], [], [], [], None, _Log()
+    sharp, widths, speeds, are_new, before, log = [], [], [], [], None, Log()
     brightest = 0
     long, short = (f"if(gt({a},{b}),{_MEASURED},-1)" for a, b in (("iw", "ih"), ("ih", "iw")))
-    small = f"{_whole(video)}scale=w='min(iw,{long})':h='min(ih,{short})',format=gray"
-    for image in _decode(video, f"showinfo=checksum=0,{small}", "pgm", log, threads):
+    small = f"{deinterlacing(video)}scale=w='min(iw,{long})':h='min(ih,{short})',format=gray"
+    for image in decode(video, f"showinfo=checksum=0,{small}", "pgm", log, threads):
         sharp.append(sharpness(image))
         widths.append(edge_width(image))
         speeds.append(0.0 if before is None else speed(before, image))
@@ -511,126 +491,7 @@ def measure(video: Path, progress: Progress, threads: int | None = None) -> tupl
     return stamps, *map(np.array, (sharp, widths, speeds, are_new)), brightest
 
 
-def extracted(
-    video: Path,
-    chosen: Sequence[int],
-    size: int | None,
-    threads: int | None = None,
-    bars: tuple[float, float] = (0.0, 0.0),
-) -> Iterator[np.ndarray]:
-    """Yield the frames ``chosen``, ascending indices: uint8 (H, W, 3), square pixels, upright.
-
-    Args:
-        video: which ``measure`` has accepted.
-        chosen: from 0.
-        size: most pixels of the longer side; None: as filmed.
-        threads: None: as many as ffmpeg likes.
-        bars: to cut off, see ``bars_of``.
-    """
-
-    def any_of(indices: Sequence[int]) -> str:
-        """Write ``n == a or n == b ...`` as a balanced tree: ffmpeg's parser allows a depth of 100."""
-        if len(indices) == 1:
-            return rf"eq(n\,{indices[0]})"
-        half = len(indices) // 2
-        return f"({any_of(indices[:half])}+{any_of(indices[half:])})"
-
-    filters = f"{_whole(video)}select='{any_of(chosen)}',scale=w='iw*sar':h=ih"
-    if max(bars) > 0:
-        filters += f",crop=w=iw*{1 - 2 * bars[0]}:h=ih*{1 - 2 * bars[1]}"
-    if size is not None:
-        fit = f"w='if(gt(iw,ih),min(iw,{size}),-1)':h='if(gt(iw,ih),-1,min(ih,{size}))'"
-        filters += f",scale={fit}:flags=area"
-    transfer = hdr_of(video)
-    filters = "setparams=colorspace=bt709," + filters if _is_untagged_hd(video) else filters
-    filters += f",{_TO_SDR.format(transfer)}" if transfer else ""
-    yield from _decode(video, f"{filters},format=rgb24", "ppm", _Log(), threads)
-
-
-def hdr_of(video: Path) -> str | None:
-    """Return ffmpeg's name of the transfer of an HDR video, HLG or PQ; None: it is SDR."""
-    match = _TRANSFER.search(_header(video))
-    return match and match[1]
-
-
-def hdr_unsaid(video: Path) -> bool:
-    """Tell whether a video may be HDR, by 10 bits and BT.2020, but does not say its transfer."""
-    return _UNSAID.search(_header(video)) is not None
-
-
-def _whole(video: Path) -> str:
-    """Return the filter that makes whole frames of an interlaced video, with its comma; else nothing."""
-    return "bwdif=mode=send_frame:deint=interlaced," if _INTERLACED.search(_header(video)) else ""
-
-
-def _is_untagged_hd(video: Path) -> bool:
-    """Tell whether a video does not say its matrix of colours and is larger than SD: players take it for
-    BT.709, ffmpeg for BT.601, which is right for SD.
-    """
-    match = _TAGS.search(_header(video))
-    if match is None or _MATRIX.search(match[1] or ""):
-        return False
-    return any(side > most for side, most in zip(sorted(map(int, match.groups()[1:]), reverse=True), _SD))
-
-
-def _header(video: Path) -> str:
-    """Return what ffmpeg says of a video."""
-    call = [imageio_ffmpeg.get_ffmpeg_exe(), "-hide_banner", "-nostdin", "-i", str(video)]
-    return subprocess.run(call, capture_output=True).stderr.decode(errors="replace")
-
-
-class _Log:
-    """What ffmpeg says while it runs: ``duration`` in seconds, 0 where unknown; ``stamps`` of the frames so
-    far; all other lines, ``rest``.
-    """
-
-    def __init__(self) -> None:
-        self.duration, self.stamps, self.rest = 0.0, [], []
-
-    def read(self, stream) -> None:
-        """Read to the end."""
-        for raw in stream:
-            line = raw.decode(errors="replace")
-            if match := _STAMP.search(line):
-                self.stamps += [float(match[1])] if match[1] != "NOPTS" else []
-            elif match := _DURATION.search(line):
-                self.duration = sum(float(part) * unit for part, unit in zip(match.groups(), (3600, 60, 1)))
-            else:
-                self.rest.append(line)
-
-
-def _decode(video: Path, filters: str, codec: str, log: _Log, threads: int | None) -> Iterator[np.ndarray]:
-    """Decode the first video stream into grey or colour images; ffmpeg's words go to ``log``."""
-    limit = ["-threads", str(threads or 0)]  # of decoder and encoder
-    begin = [imageio_ffmpeg.get_ffmpeg_exe(), "-hide_banner", "-nostdin", "-nostats"]
-    shape = ["-map", "0:v:0", "-vf", filters, "-filter_threads", limit[1], "-fps_mode", "passthrough"]
-    call = [*begin, *limit, "-i", str(video), *shape, *limit, "-f", "image2pipe", "-c:v", codec, "-"]
-    with subprocess.Popen(call, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
-        reader = Thread(target=log.read, args=[process.stderr])
-        reader.start()
-        try:
-            while (image := _read_netpbm(process.stdout)) is not None:
-                yield image
-        except BaseException:  # also where no more are asked for
-            process.kill()
-            raise
-        finally:
-            reader.join()
-
-
-def _read_netpbm(stream) -> np.ndarray | None:
-    """Read one binary PGM (H, W) or PPM (H, W, 3); None at the end."""
-    kind = stream.readline().strip()
-    if kind not in (b"P5", b"P6"):
-        return None
-    width, height = map(int, stream.readline().split())
-    stream.readline()
-    shape = (height, width, 3) if kind == b"P6" else (height, width)
-    raw = stream.read(math.prod(shape))
-    return np.frombuffer(raw, np.uint8).reshape(shape) if len(raw) == math.prod(shape) else None
-
-
-def _refuse(video: Path, log: _Log, count: int) -> None:
+def _refuse(video: Path, log: Log, count: int) -> None:
     """Refuse what gives no frames, one frame, or fewer than the file promises."""
     stamps, text = log.stamps, "".join(log.rest)
     if not count:

@@ -1,0 +1,187 @@
+"""Decode videos with ffmpeg: frames upright, of square pixels, in SDR and whole, none dropped or repeated."""
+
+from __future__ import annotations
+
+import math
+import re
+import subprocess
+from collections.abc import Iterator, Sequence
+from fractions import Fraction
+from functools import lru_cache
+from pathlib import Path
+from threading import Thread
+
+import imageio_ffmpeg
+import numpy as np
+
+_STAMP = re.compile(r"Parsed_showinfo.* n: *\d+ .* pts_time:(\S+)")
+_DURATION = re.compile(r"Duration: (\d+):(\d+):([\d.]+)")
+HDR = {"arib-std-b67": "HLG", "smpte2084": "PQ"}
+_TRANSFER = re.compile(r"Video: .*\b(" + "|".join(HDR) + r")\b")
+# Of more than 8 bits, with matrix/primaries/transfer of which one of the first is BT.2020's, the last none.
+_UNSAID = re.compile(
+    r"Video: .*p0?1[0-6](?:le|be)?\((?:[^)]*, ?)?(?:bt2020\w*/[\w-]+|[\w-]+/bt2020)/(?:unknown|reserved)\b"
+)
+# The tags of a stream, and its size; a matrix of colours stands first in its tag.
+_TAGS = re.compile(r"Video: [^,]*, \w+(?:\(([^)]*)\))?, (\d+)x(\d+)")
+_MATRIX = re.compile(r"\b(?<!/)(bt|smpte|fcc|gbr|ycg|ictcp)")
+_INTERLACED = re.compile(r"Video: .*\b(top|bottom) (coded )?first\b")
+_SD = 1024, 576  # pixels of the longer and the shorter side, at most
+# 203 cd/m2 are the white of SDR (BT.2408); below 0.8 of it colours stay, above they are compressed.
+_TO_SDR = (
+    "zscale=tin={0}:pin=bt2020:min=bt2020nc:t=linear:npl=203:agamma=false,format=gbrpf32le,zscale=p=bt709,"
+    "tonemap=mobius:param=0.8:peak=4.9:desat=0,zscale=t=bt709:m=bt709:r=pc"
+)
+
+
+def extracted(
+    video: Path,
+    chosen: Sequence[int] | None,
+    size: int | None,
+    threads: int | None = None,
+    bars: tuple[float, float] = (0.0, 0.0),
+    start: float | None = None,
+) -> Iterator[np.ndarray]:
+    """Yield the frames ``chosen``, ascending indices: uint8 (H, W, 3), square pixels, upright.
+
+    Args:
+        video: any that ffmpeg reads.
+        chosen: from 0; None: all.
+        size: most pixels of the longer side; None: as filmed.
+        threads: None: as many as ffmpeg likes.
+        bars: to cut off, shares of the width at the left and at the right each, and of the height.
+        start: seconds; count from the first frame that is not before it. Of those before only such are
+            decoded as others depend on.
+    """
+
+    def any_of(indices: Sequence[int]) -> str:
+        """Write ``n == a or n == b ...`` as a balanced tree: ffmpeg's parser allows a depth of 100."""
+        if len(indices) == 1:
+            return rf"eq(n\,{indices[0]})"
+        half = len(indices) // 2
+        return f"({any_of(indices[:half])}+{any_of(indices[half:])})"
+
+    select = "" if chosen is None else f"select='{any_of(chosen)}',"
+    filters = f"{deinterlacing(video)}{select}scale=w='iw*sar':h=ih"
+    if max(bars) > 0:
+        filters += f",crop=w=iw*{1 - 2 * bars[0]}:h=ih*{1 - 2 * bars[1]}"
+    if size is not None:
+        fit = f"w='if(gt(iw,ih),min(iw,{size}),-1)':h='if(gt(iw,ih),-1,min(ih,{size}))'"
+        filters += f",scale={fit}:flags=area"
+    transfer = hdr_of(video)
+    filters = "setparams=colorspace=bt709," + filters if _is_untagged_hd(video) else filters
+    filters += f",{_TO_SDR.format(transfer)}" if transfer else ""
+    yield from decode(video, f"{filters},format=rgb24", "ppm", Log(), threads, start)
+
+
+def hdr_of(video: Path) -> str | None:
+    """Return ffmpeg's name of the transfer of an HDR video, HLG or PQ; None: it is SDR."""
+    match = _TRANSFER.search(header_of(video))
+    return match and match[1]
+
+
+def hdr_unsaid(video: Path) -> bool:
+    """Tell whether a video may be HDR, by 10 bits and BT.2020, but does not say its transfer."""
+    return _UNSAID.search(header_of(video)) is not None
+
+
+def deinterlacing(video: Path) -> str:
+    """Return the filter that makes whole frames of an interlaced video, with its comma; else nothing."""
+    return "bwdif=mode=send_frame:deint=interlaced," if _INTERLACED.search(header_of(video)) else ""
+
+
+def _is_untagged_hd(video: Path) -> bool:
+    """Tell whether a video does not say its matrix of colours and is larger than SD: players take it for
+    BT.709, ffmpeg for BT.601, which is right for SD.
+    """
+    match = _TAGS.search(header_of(video))
+    if match is None or _MATRIX.search(match[1] or ""):
+        return False
+    return any(side > most for side, most in zip(sorted(map(int, match.groups()[1:]), reverse=True), _SD))
+
+
+def header_of(video: Path) -> str:
+    """Return what ffmpeg says of a video; kept until the file changes."""
+    try:
+        about = video.stat()
+    except OSError:  # ffmpeg says so
+        return _header(video, 0, 0)
+    return _header(video, about.st_size, about.st_mtime_ns)
+
+
+@lru_cache(64)
+def _header(video: Path, size: int, changed: int) -> str:
+    call = [imageio_ffmpeg.get_ffmpeg_exe(), "-hide_banner", "-nostdin", "-i", str(video)]
+    return subprocess.run(call, capture_output=True).stderr.decode(errors="replace")
+
+
+def stamps_of(video: Path) -> np.ndarray:
+    """Read the times of a video's frames, seconds, ascending, decoding none; empty where it is no video."""
+    call = [imageio_ffmpeg.get_ffmpeg_exe(), "-nostdin", "-v", "quiet", "-i", str(video), "-map", "0:v:0"]
+    done = subprocess.run([*call, "-c", "copy", "-f", "framecrc", "-"], capture_output=True)
+    lines = done.stdout.decode(errors="replace").splitlines()
+    unit = next((Fraction(line.split(":")[1].strip()) for line in lines if line.startswith("#tb 0:")), 1)
+    ticks = (line.split(",")[2].strip() for line in lines if not line.startswith("#"))
+    return np.sort([float(int(tick) * unit) for tick in ticks if tick.lstrip("-").isdecimal()])
+
+
+class Log:
+    """What ffmpeg says while it runs: ``duration`` in seconds, 0 where unknown; ``stamps`` of the frames so
+    far; all other lines, ``rest``.
+    """
+
+    def __init__(self) -> None:
+        self.duration, self.stamps, self.rest = 0.0, [], []
+
+    def read(self, stream) -> None:
+        """Read to the end."""
+        for raw in stream:
+            line = raw.decode(errors="replace")
+            if match := _STAMP.search(line):
+                self.stamps += [float(match[1])] if match[1] != "NOPTS" else []
+            elif match := _DURATION.search(line):
+                self.duration = sum(float(part) * unit for part, unit in zip(match.groups(), (3600, 60, 1)))
+            else:
+                self.rest.append(line)
+
+
+def decode(
+    video: Path, filters: str, codec: str, log: Log, threads: int | None, start: float | None = None
+) -> Iterator[np.ndarray]:
+    """Decode the first video stream into images, grey (pgm) or colour (ppm).
+
+    Args:
+        video: any that ffmpeg reads.
+        filters: of ffmpeg.
+        codec: pgm or ppm.
+        log: takes what ffmpeg says.
+        threads, start: see ``extracted``.
+    """
+    limit = ["-threads", str(threads or 0)]  # of decoder and encoder
+    begin = [imageio_ffmpeg.get_ffmpeg_exe(), "-hide_banner", "-nostdin", "-nostats"]
+    shape = ["-map", "0:v:0", "-vf", filters, "-filter_threads", limit[1], "-fps_mode", "passthrough"]
+    seek = [] if start is None else ["-ss", f"{start:.6f}"]
+    call = [*begin, *limit, *seek, "-i", str(video), *shape, *limit, "-f", "image2pipe", "-c:v", codec, "-"]
+    with subprocess.Popen(call, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+        reader = Thread(target=log.read, args=[process.stderr])
+        reader.start()
+        try:
+            while (image := _read_netpbm(process.stdout)) is not None:
+                yield image
+        except BaseException:  # also where no more are asked for
+            process.kill()
+            raise
+        finally:
+            reader.join()
+
+
+def _read_netpbm(stream) -> np.ndarray | None:
+    """Read one binary PGM (H, W) or PPM (H, W, 3); None at the end."""
+    kind = stream.readline().strip()
+    if kind not in (b"P5", b"P6"):
+        return None
+    width, height = map(int, stream.readline().split())
+    stream.readline()
+    shape = (height, width, 3) if kind == b"P6" else (height, width)
+    raw = stream.read(math.prod(shape))
+    return np.frombuffer(raw, np.uint8).reshape(shape) if len(raw) == math.prod(shape) else None
