@@ -39,6 +39,7 @@ def test_scores_are_the_metrics_in_fixed_order(alex):
     assert list(scores) == [name for name in METRICS if name not in absent]
     for name in ("psnr", "ssim", "ms_ssim", "ms_ssim_legacy"):
         assert scores[name] == getattr(image, name)(prediction, true.rgb)
+    assert scores["dssim"] == (1 - scores["ms_ssim"]) / 2
     assert scores["lpips_alex"] == alex(prediction, true.rgb)
     assert [scores[f"depth_delta_{ratio}"] for ratio in ("1.02", "1.25", "1.5625")] == [0.0, 1.0, 1.0]
 

@@ -40,6 +40,7 @@ class Metric:
         needs_depth: only computed where both the rendered and the true depth are known.
         needs_foreground: None tells that the image has no foreground.
         least_side: fewest pixels that a side of the image must have.
+        dissimilarity_of: a similarity before it in the list, of which it is half of what is missing to 1.
     """
 
     name: str
@@ -52,6 +53,7 @@ class Metric:
     needs_depth: bool = False
     needs_foreground: bool = False
     least_side: int = 0
+    dissimilarity_of: str = ""
 
     @property
     def heading(self) -> str:
@@ -147,6 +149,13 @@ METRICS: dict[str, Metric] = {
             score=_of_image("ms_ssim_legacy"),
             least_side=MS_SSIM_LEAST_SIDE,
         ),
+        Metric(
+            "dssim",
+            "DSSIM",
+            higher_is_better=False,
+            summary=False,
+            dissimilarity_of="ms_ssim",  # tables of Neural 3D Video's scenes have it so, or of ssim
+        ),
         # Distances of different backbones are not comparable; weights are files, so the suite holds the nets.
         *(
             Metric(f"lpips_{net}", f"LPIPS ({net})", higher_is_better=False, least_side=LPIPS_LEAST_SIDE)
@@ -229,6 +238,8 @@ class ImageSuite:
                 lacks_depth = metric.needs_depth and (predicted_depth is None or target.depth is None)
                 if name in self.lpips:
                     value = self.lpips[name](prediction, target.rgb)
+                elif metric.dissimilarity_of in scores:
+                    value = (1 - scores[metric.dissimilarity_of]) / 2
                 elif metric.score is None or lacks_depth or (name == "psnr_box" and not self.mask_box):
                     continue
                 else:
