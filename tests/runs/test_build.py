@@ -7,7 +7,7 @@ import torch
 from omegaconf import OmegaConf
 
 from forewarp.cli.train import beginning
-from forewarp.runs.build import build_run, check_trainer, device_for, why_on_cpu
+from forewarp.runs.build import build_run, check_trainer, device_for, hyperparameters, why_on_cpu
 from forewarp.runs.config import content_hash
 from tests.support.configs import composed
 
@@ -127,3 +127,14 @@ def test_one_process_trains_a_run(devices, nodes, got):
 def test_a_profiler_of_another_name_is_refused():
     with pytest.raises(ValueError, match="trainer.profiler: expected simple, advanced or null, but got slow"):
         build_run(config_of("+trainer.profiler=slow"))
+
+
+def test_hyperparameters_are_flat_and_hold_no_paths():
+    config = composed("experiment=demo", "model=forward")
+    config.command = "forewarp-train experiment=demo data.root=/home/me/scenes run=/tmp/run model=forward"
+    found = hyperparameters(config)
+    assert found["_typed"] == "experiment=demo model=forward"
+    assert (found["model.name"], found["model"]) == ("forward", "ForwardWarp")
+    assert found["stage.fine.lr.density"] == config.stage.fine.lr.density
+    assert all(isinstance(value, bool | int | float | str) for value in found.values())
+    assert not any("/" in str(value) or "root" in name for name, value in found.items())

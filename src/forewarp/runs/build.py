@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from functools import partial
@@ -15,6 +16,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from forewarp.clock import Clock
 from forewarp.runs.config import IDENTITY, instead_of
+from forewarp.runs.overrides import TEXTS, key_of
 from forewarp.training.callbacks import StageProgress
 from forewarp.training.loggers import RunLoggers
 from forewarp.training.schedule import StagePlan, seconds_after, share_out
@@ -106,9 +108,11 @@ def loggers_of(config: DictConfig) -> RunLoggers:
 def hyperparameters(config: DictConfig) -> dict[str, object]:
     """List what makes a run what it is, by flat names and without paths, for the tables of its loggers.
 
-    A part of a method is named by its class: ``model.radiance: Grid``.
+    A part of a method is named by its class: ``model.radiance: Grid``. ``_typed``, first in a sorted table,
+    holds the overrides of the command.
     """
-    found: dict[str, object] = {}
+    typed = shlex.split(config.get("command") or "")[1:]
+    found: dict[str, object] = {"_typed": " ".join(o for o in typed if not TEXTS.fullmatch(key_of(o)))}
 
     def walk(value: object, name: str) -> None:
         if isinstance(value, dict):
