@@ -20,7 +20,15 @@ from tests.support.configs import ROOT, composed
 
 PAPER = {"dnerf": 24, "hypernerf": 12, "nhr": 12, "lego_complete": 9, "ablation_modules": 60}
 PAPER |= {"ablation_losses": 32, "resolution": 16, "methods": 24}
-OTHERS = {"accuracy_time", "effects", "price_list_forward", "price_list_particles", "search", "minutes"}
+OTHERS = {
+    "accuracy_time",
+    "effects",
+    "price_list_forward",
+    "price_list_particles",
+    "search",
+    "search_keys",
+    "minutes",
+}
 COUNTS = {"forward": 45, "particles": 48}
 CHANGES = {
     name: yaml.safe_load((ROOT / "sweeps" / f"price_list_{name}.yaml").read_text())["hydra"]["sweeper"][

@@ -301,3 +301,19 @@ def test_the_recorded_command_of_a_run_runs_again(ok, found, in_tmp, originals):
         assert json.loads((run / "metrics.json").read_text())["test"] == scores
     ok("report", "kind=accuracy_time", "runs=runs", "out=page")
     assert "balls-fast" in (in_tmp / "page" / "accuracy-time.md").read_text()
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore")  # Optuna raises deprecation warnings of its own
+def test_a_method_is_searched_and_its_trials_are_reported(ok, found, in_tmp):
+    reason = "needs hydra-optuna-sweeper: install forewarp[sweeps]"
+    pytest.importorskip("hydra_plugins.hydra_optuna_sweeper", reason=reason)
+    ranges = ["stage.fine.lr.place=tag(log,interval(1e-3,1e-1))", "model.count=range(8,200)"]
+    words = [*BALLS, *found, "data.held_out=2", *ranges, "hydra.sweeper.n_trials=3"]
+    ok("train", "--multirun", "sweeps=search_keys", *words)
+    assert "search-toy.csv" in ok("report", "kind=search").out
+    page = (in_tmp / "runs" / "search" / "results" / "search.md").read_text()
+    header, _, *rows = [line.split("|")[1:-1] for line in page.splitlines() if line.startswith("|")]
+    assert {"stage.fine.lr.place", "model.count"} <= {cell.strip() for cell in header}
+    scores = [float(row[-3]) for row in rows]
+    assert (len(scores), scores) == (3, sorted(scores, reverse=True))

@@ -1,5 +1,6 @@
 """Pages of choices, of runs that nobody trained: accuracy against time, the price list, effects."""
 
+import json
 import os
 
 import pytest
@@ -7,7 +8,13 @@ import yaml
 
 from forewarp.report import figures
 from forewarp.report.benchmark import Published
-from forewarp.report.choices import choices, write_accuracy_time, write_effects, write_price_list
+from forewarp.report.choices import (
+    choices,
+    write_accuracy_time,
+    write_effects,
+    write_price_list,
+    write_search,
+)
 from forewarp.report.results import read_runs
 from tests.support.runs_on_disk import rows_of, write_run
 
@@ -160,3 +167,32 @@ def test_of_two_runs_of_a_choice_the_last_one_counts(tmp_path):
     os.utime(last / "metrics.json", (2e9, 2e9))
     text = write_effects(tmp_path, tmp_path / "out")[0].read_text()
     assert rows_of(text, "ball")[0][2] == "31.00"
+
+
+def test_trials_of_a_search_are_listed_the_best_first(tmp_path):
+    runs = tmp_path / "runs"
+    for trial, (rate, score) in enumerate([("0.001", 20.0), ("0.01", 25.5), ("3e-3", 22.0), ("0.1", None)]):
+        words = f"forewarp-train model=balls preset=demo stage.fine.lr.place={rate} data.root=/home/me/scenes"
+        run = write_run(
+            runs, f"t{trial}", psnr=None, command=words, config={"score": "psnr"}, steps=100 + trial
+        )
+        if score is not None:
+            (run / "score.json").write_text(
+                json.dumps({"views": "8 held out views", "scores": {"psnr": score}})
+            )
+    page, table = write_search(runs, tmp_path / "out")
+    text, lines = page.read_text(), table.read_text().splitlines()
+    assert "## ball, forward, by psnr of 8 held out views" in text
+    assert rows_of(text, "1") == [["1", "0.01", "25.50", "101", "0.8333"]]
+    assert [line.split(",")[1] for line in lines[1:]] == ["0.01", "0.003", "0.001"]
+    assert lines[0].split(",")[:2] == ["place", "stage.fine.lr.place"]
+    assert "stage.fine.lr.place=0.01 data.root=SCENES" in text
+    assert "t3-1.0-seed0: no score.json; run its command again" in text
+
+
+def test_the_best_of_a_search_for_a_small_score_is_the_smallest(tmp_path):
+    for trial, score in enumerate([0.3, 0.1]):
+        words, config = f"forewarp-train preset.rays={trial}", {"score": "lpips_squeeze"}
+        run = write_run(tmp_path, f"t{trial}", psnr=None, command=words, config=config)
+        (run / "score.json").write_text(json.dumps({"views": "2 views", "scores": {"lpips_squeeze": score}}))
+    assert "preset.rays=1\n```" in write_search(tmp_path, tmp_path / "out")[0].read_text()

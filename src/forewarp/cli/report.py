@@ -8,6 +8,7 @@ forewarp-report makes tables, curves and pages of runs that are already there. O
   kind=minutes        what each method reaches on each scene in so many minutes, by seed and view
   kind=methods        all methods under one clock: what each reaches, PSNR against seconds, views side by side
   kind=effects        planned runs against every effect at once and the paper's fixed set
+  kind=search         the trials of a search, the best first: what was chosen, score, steps, minutes
   kind=compare        a few runs side by side, printed, and with out=FOLDER drawn
   kind=run            the page of one run: its video, truth against prediction, curves, effects and why
 
@@ -16,7 +17,7 @@ forewarp-report makes tables, curves and pages of runs that are already there. O
   forewarp-report kind=run run=runs/vehicle/particles-demo-seed0
 
 What one types most:
-  runs=FOLDER            searched for runs (runs/accuracy_time, minutes, effects, ablations, else paper)
+  runs=FOLDER            searched for runs (runs/accuracy_time, minutes, effects, search, ..., else paper)
   runs=[FOLDER,FOLDER]   compare: the runs themselves; patterns with * are expanded
   out=FOLDER             where the page goes (results/ below the runs); compare: where the picture goes
   target=DB              accuracy_time: PSNR that every variant's seconds are listed for
@@ -93,6 +94,7 @@ KINDS = {
     "minutes": Kind("minutes", "benchmark.write_minutes", published_points),
     "methods": Kind("paper", "benchmark.write_methods"),
     "effects": Kind("effects", "choices.write_effects"),
+    "search": Kind("search", "choices.write_search"),
 }
 NAMES = (*KINDS, "compare", "run")
 MEGABYTES = 0.3, 1000  # least and most that may be asked for

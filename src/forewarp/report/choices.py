@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from statistics import fmean, mode
 
-from forewarp.files import replace_file
+from forewarp.files import read_json, replace_file
 from forewarp.metrics.gain import FACTORS, Estimate, measure_effect
 from forewarp.metrics.registry import METRICS, metric_of
 from forewarp.report.figures import draw_scene
@@ -310,6 +310,59 @@ def trials(planned: Sequence[Row]) -> Table:
     columns = {"scene": "scene", "seed": Column("seed", 0)}
     columns |= {name: Column(name.replace("_", " "), signed=True) for name in names}
     return Table.of(lines, columns, caption)
+
+
+def write_search(folder: Path, out: Path) -> list[Path]:
+    """Write ``search.md``, and a CSV file a scene: the trials of ``sweeps=search``, the best first."""
+    runs, left_out = read_runs(folder, ["score.json"])
+    searches, written = [], []
+    for (scene, method, metric), found in (
+        Runs(row for run in runs for row in _scored(run)).by(*SEARCHED).items()
+    ):
+        known = metric_of(metric)
+        best_first = sorted(found, key=lambda row: row["score"], reverse=known.higher_is_better)
+        table = _trials(best_first, Column(known.heading, known.digits))
+        title, name = f"{scene}, {method}, by {metric} of {best_first[0]['scored']}", f"search-{scene}"
+        name += f"-{method}" * (len(runs.where(scene=scene).by("method")) > 1)
+        file = out / f"{name}.csv"
+        replace_file(file, table.csv())
+        searches.append({"title": title, "table": table, "command": portable(best_first[0]["command"])})
+        written.append(file)
+    text = rendered("search.md.j2", searches=searches, left_out=left_out)
+    replace_file(out / "search.md", text)
+    return [out / "search.md", *written]
+
+
+SEARCHED = ("scene", "method", "metric")  # runs that are equal in these are trials of one search
+
+
+def _scored(row: Row) -> list[Row]:
+    """Return a run with the score that its search went by; nothing where the run has none."""
+    stored, metric = read_json(row["folder"] / "score.json") or {}, row["config"].get("score")
+    score = (stored.get("scores") or {}).get(metric)
+    seconds = [float(done["seconds"]) for done in row["stages"].values()]
+    about = {"metric": metric, "score": score, "scored": stored.get("views"), "minutes": sum(seconds) / 60}
+    return [row | about] if isinstance(score, int | float) else []
+
+
+def _trials(trials: Sequence[Row], score: Column) -> Table:
+    """List trials by the overrides in which they differ."""
+    typed = [dict(word.partition("=")[::2] for word in overrides(row["command"])) for row in trials]
+    keys = dict.fromkeys(key for words in typed for key in words if key not in ("run", "forewarp-train"))
+    chosen = [key for key in keys if len({words.get(key) for words in typed}) > 1]
+    rows = [
+        [number + 1, *(_value(words.get(key)) for key in chosen), row["score"], row["steps"], row["minutes"]]
+        for number, (row, words) in enumerate(zip(trials, typed))
+    ]
+    columns = [Column("place", 0), *(Column(key, None) for key in chosen)]
+    return Table([*columns, score, Column("steps", 0), Column("minutes", None)], rows)
+
+
+def _value(text: str | None) -> float | str | None:
+    try:
+        return float(text)
+    except (TypeError, ValueError):
+        return text
 
 
 MEASURED = {"steps": ("steps", 0), "train": ("seconds of training", 0), "frame": ("seconds per image", 3)}
