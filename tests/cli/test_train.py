@@ -107,9 +107,10 @@ def test_evaluating_again_gives_the_same_numbers_or_others(ok, fitted, copied, s
     assert numbers(copied) == numbers(fitted)
     path = copied / "fine" / "done.json"
     path.write_text(json.dumps(read(path) | {"commit": "0123abcde"}))  # by which it was trained, not measured
-    ok("evaluate", f"run={copied}", f"data.root={moved}", "reduce=2")
+    ok("evaluate", f"run={copied}", f"data.root={moved}", "reduce=2", "eval_background=black")
     protocol = read(copied / "metrics.json")["protocol"]
     assert (protocol["reduced"], protocol["commit"]) == (2, "0123abcde")
+    assert protocol["background"] == "black"
     assert numbers(copied)["test"] != numbers(fitted)["test"]
 
 

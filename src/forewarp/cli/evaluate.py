@@ -12,6 +12,7 @@ What one types most:
   lpips_weights=FILE       a backbone's weights, or a folder of them, for LPIPS
   views=N                  measure N test views, evenly spread, in place of all
   reduce=2                 average 2 x 2 pixels of each view and of its truth, then score
+  eval_background=black    measure before another background, white or black; cut-out images alone have one
   sheets=N                 how many pictures of truth | prediction | error
   threads=N trainer=cpu    threads and device to compute with
 """
@@ -29,6 +30,9 @@ def evaluate(config) -> None:
     refuse_numbers(config, "views", "sheets", "reduce")
     saved = saved_config(config.run, config)
     saved.views, saved.reduce = config.views, config.reduce  # not those of the run: null is all, and whole
+    behind = config.eval_background
+    if behind is not None:
+        saved.data.eval_background = behind
     # These load torch; mistakes have been answered before.
     from forewarp.runs.build import build_run
     from forewarp.runs.fitted import measure_run
@@ -39,6 +43,11 @@ def evaluate(config) -> None:
     with locked(run.folder):
         module = run.load().to(place)
         warn_if_changed(run)
+        if behind is not None and not run.datamodule.scene.has_alpha:
+            raise ValueError(
+                f"eval_background: expected a run on cut-out images, but got {behind} for images that are "
+                "opaque and have no background; leave it out"
+            )
         measure_run(run, module, saved)
 
 
