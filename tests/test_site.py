@@ -78,7 +78,7 @@ def composed(line: str) -> tuple[str, list[str]]:
     name, *words = shlex.split(line)
     kept = [word for word in words if not word.startswith(("--", "job", "launcher=", "hydra."))]
     if "--multirun" in words:
-        kept = [word.split(",")[0] for word in kept]
+        kept = [re.sub(r"=(tag|range|interval)\(.*", "=1", word).split(",")[0] for word in kept]
     return name, [*kept, "--cfg", "job"]
 
 
@@ -139,7 +139,7 @@ def test_commands_of_the_pages_are_understood(line, in_tmp):
     name, words = composed(line)
     if importlib.util.find_spec(f"forewarp.cli.{name}") is None:
         pytest.skip(f"no forewarp-{name}")
-    if "sweeps=search" in words:
+    if {"sweeps=search", "sweeps=search_keys"} & set(words):
         pytest.importorskip("hydra_plugins.hydra_optuna_sweeper", reason="no Optuna: make install-launchers")
     done = call(name, *words)
     assert done.status in (None, 0), done.err
