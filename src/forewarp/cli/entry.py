@@ -12,9 +12,9 @@ import traceback
 import warnings
 from collections.abc import Callable
 from contextlib import suppress
-from importlib.metadata import version
 from pathlib import Path
 
+import forewarp
 from forewarp.cli.mistakes import flat, one_line, refuse_dashes, unknown_key, with_run_key
 from forewarp.runs import overrides
 from forewarp.runs.config_files import configurations, installed, project_root
@@ -43,7 +43,7 @@ def command(name: str, task: Callable, text: str, *, config: str | None = None) 
             print(text.strip() + "\n\n" + choices(project_root() / "conf", config or name), flush=True)
             sys.exit(0)
         if "--version" in sys.argv[1:]:
-            print(f"forewarp {version('forewarp')}", flush=True)
+            print(f"forewarp {forewarp.__version__}", flush=True)
             sys.exit(0)
         if any(argument.partition("=")[0] in ("--info", "-i") for argument in sys.argv[1:]):
             logging.disable(logging.NOTSET)  # Hydra logs what it prints

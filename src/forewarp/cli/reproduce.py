@@ -70,8 +70,8 @@ OF_ABLATIONS = shlex.split(
 )
 ROOM = ["stage.coarse.background_num_voxels=[[0,27000]]", "stage.fine.background_num_voxels=[[0,110592]]"]
 SPECIMENS = ["still", "rigid", "band", "glossy", "room", "quick", "daylight", "blocks", "spin"]
-# With small=1: a hundredth of a minute, or four steps, and one test view a run; gpu has a tiny model, too.
-SMALL = shlex.split("views=1 sheets=0 logger=none callbacks.pictures=null plan.steps=4 plan.trial_steps=4")
+# With small=1, beside Job.small; gpu has a tiny model, too.
+SMALL = shlex.split("sheets=0 logger=none callbacks.pictures=null plan.steps=4 plan.trial_steps=4")
 TINY = shlex.split(
     "data.scene=tiny paths.data=runs/bench-gpu data.synthesis.size=32 data.synthesis.frames=8 "
     "data.synthesis.test_views=[1,1,1] preset.rays=64 preset.inpainter_width=16 data.held_out=2 "
@@ -119,6 +119,11 @@ class Job:
     lanes: list[list[Sweep]]
     then: list[list[str]]
     jobs: int = 1
+    small: tuple[str, str, str] = (
+        "0.01",
+        "4",
+        "1",
+    )  # with small=1: minutes, or steps, and test views of a run
 
 
 def plan_of(kind: str, keys: Keys) -> Job:
@@ -141,15 +146,16 @@ def _made_small(job: Job) -> Job:
 
     def shortened(sweep: Sweep) -> Sweep:
         by_steps = any(word.startswith("budget.iterations=") for word in sweep)
-        until = ["budget.minutes=null", "budget.iterations=4"] if by_steps else ["budget.minutes=0.01"]
-        return apart(merged(sweep, [*SMALL, *until]))
+        minutes, steps, views = job.small
+        until = _until(steps=steps) if by_steps else _until(minutes)
+        return apart(merged(sweep, [*SMALL, *until, f"views={views}"]))
 
     def apart(command: list[str]) -> list[str]:
         moved = [word.replace("out=docs/", "out=runs/").replace("runs/", "runs/small/") for word in command]
         return moved if moved != command else [*moved, "paths.runs=runs/small"]
 
     lanes = [[shortened(sweep) for sweep in lane] for lane in job.lanes]
-    return Job(lanes, [apart(command) for command in job.then], job.jobs)
+    return Job(lanes, [apart(command) for command in job.then], job.jobs, job.small)
 
 
 def words(text: str) -> list[str]:
@@ -243,13 +249,15 @@ def ablations(keys: Keys) -> Job:
             f"of real scenes: forewarp-reproduce tables data={keys.data or 'FOLDER'} sweeps=ablations"
         )
     common = [f"preset={keys.preset or 'demo'}", f"views={keys.views or 9}", "score=null", *keys.drawn("2")]
+    of_all = [word for word in OF_ABLATIONS if not (keys.small and word.startswith("callbacks.accuracy"))]
+    of_all += ["callbacks.accuracy=null"] if keys.small else []  # the page shows no curve
     by_minutes, by_steps = (
-        _counterparts("ablations", [*common, *until, *OF_ABLATIONS], keys)
+        _counterparts("ablations", [*common, *until, *of_all], keys)
         for until in (_until(keys.minutes or "2.5"), _until(steps=keys.steps or "600"))
     )
     then = [["report", "kind=ablation", "runs=runs/ablations", f"out={keys.out or 'docs/results'}"]]
     lanes = [first + second for first, second in zip(by_minutes, by_steps, strict=True)]
-    return Job(lanes, then, int(keys.jobs))
+    return Job(lanes, then, int(keys.jobs), small=("0.03", "12", "5"))
 
 
 def _compared(keys: Keys, base: Sweep) -> list[Sweep]:
