@@ -7,6 +7,7 @@ SIGKILL at the n-th file that takes its place, ``before``, ``after`` or with ``h
 ``end`` only files count whose path ends so).
 """
 
+import gc
 import json
 import os
 import resource
@@ -96,16 +97,24 @@ def serve():
     from forewarp.cli.entry import quiet
 
     quiet()
-    import hydra  # noqa: F401
     import lightning  # noqa: F401
+    import matplotlib.backends.backend_agg  # noqa: F401
     import torch
+    from PIL import Image
 
-    import forewarp.data.module
+    import forewarp.cli.prepare
     import forewarp.evaluation.evaluate
+    import forewarp.methods.particles.model
+    import forewarp.methods.voxel.forward
+    import forewarp.ops.kernels.voxels
+    import forewarp.report.figures
     import forewarp.runs.build
     import forewarp.training.stages  # noqa: F401
 
+    Image.init()
     torch.set_num_threads(1)
+    gc.collect()
+    gc.freeze()  # or every child would look through it all
     for line in sys.stdin:
         pid = os.fork()
         if pid == 0:
