@@ -2,7 +2,16 @@ import pytest
 import torch
 
 from forewarp.drawing.images import error_colors
-from forewarp.evaluation.images import image_flow, images_of, sized, validation_psnr, within
+from forewarp.evaluation.images import (
+    image_flow,
+    images_of,
+    make_shots,
+    sized,
+    validation_psnr,
+    video,
+    within,
+)
+from forewarp.evaluation.trajectories import Trajectories, moving_points
 from forewarp.scene.view import Target
 from tests.support.tiny_scene import RADIUS, TRAVEL, ball_center, ball_data, ball_scene, camera_at, known_ball
 
@@ -58,3 +67,93 @@ def test_sizes_follow_the_longer_side():
     camera = camera_at(0.0, size=40).resized(80, 40)
     cameras = within(camera, 60), within(camera, 90), within(camera, None), sized(camera, 160)
     assert [(c.width, c.height) for c in cameras] == [(60, 30), (80, 40), (80, 40), (160, 80)]
+
+
+WHITE = torch.ones(3)
+
+
+@pytest.fixture(scope="module")
+def cameras():
+    return [frame.camera for frame in ball_scene(frames=12, size=24).train]
+
+
+def test_fixed_goes_through_all_time(cameras):
+    shots = make_shots("fixed", 5, 0.5, cameras[0], cameras)
+    assert all(camera is cameras[0] for camera, _ in shots)
+    assert [time for _, time in shots] == [0, 0.25, 0.5, 0.75, 1]
+
+
+@pytest.mark.parametrize(("path", "times"), [("orbit", [0.3] * 4), ("both", [0, 1 / 3, 2 / 3, 1])])
+def test_a_turn_starts_at_the_view_and_stops_before_it_comes_again(cameras, path, times):
+    shots = make_shots(path, 4, 0.3, cameras[0], cameras)
+    assert [time for _, time in shots] == pytest.approx(times)
+    centers = torch.stack([camera.center for camera, _ in shots])
+    torch.testing.assert_close(centers[0], cameras[0].center)
+    middle = (centers[0] + centers[2]) / 2
+    torch.testing.assert_close(middle, (centers[1] + centers[3]) / 2)
+    assert float((centers - middle).norm(dim=-1).min()) > 1
+
+
+def test_a_swing_stays_between_the_cameras_while_time_passes(cameras):
+    shots = make_shots("swing", 5, 0.5, cameras[3], cameras[:7])
+    assert [time for _, time in shots] == [0, 0.25, 0.5, 0.75, 1]
+    torch.testing.assert_close(shots[0][0].center, cameras[3].center)
+
+
+def test_the_warp_is_made_once_a_time(cameras):
+    module = known_ball()
+    pictures = list(video(module, make_shots("orbit", 3, 0.5, cameras[0], cameras), WHITE))
+    assert module.method.asked == [0.5]
+    assert [tuple(p.shape) for p in pictures] == [(24, 24, 3)] * 3
+    assert not torch.equal(pictures[0], pictures[1])
+    list(video(module, make_shots("fixed", 3, 0.5, cameras[0], cameras), WHITE))
+    assert module.method.asked == [0.5, 0, 0.5, 1]
+
+
+def test_points_lie_on_the_surface_that_moves(cameras):
+    module = known_ball()
+    points = moving_points(module, cameras, 60)
+    assert points.shape == (60, 3)
+    assert not bool(module.method.is_still(points).any())
+    from_center = (points - torch.tensor([-0.3, 0.1, 0.0])).norm(dim=-1)
+    assert float(from_center.min()) > 0.4 - 2 * module.method.radiance.lattice.voxel_size
+    assert float(from_center.max()) < 0.4 + module.method.radiance.lattice.voxel_size
+    torch.testing.assert_close(points, moving_points(module, cameras, 60))
+
+
+def test_tails_follow_the_ball_and_nothing_is_drawn_before_it_moves(cameras):
+    module = known_ball()
+    camera = camera_at(0.75, size=60)  # looks along y: the ball slides across the picture
+    paint = Trajectories(module, cameras, count=80, tail=1.0)
+    shots = [(camera, 0.0), (camera, 1.0)]
+    plain = list(video(module, shots, WHITE))
+    drawn = list(video(module, shots, WHITE, paint))
+    ink = [(a - b).abs().amax(-1) > 0.05 for a, b in zip(plain, drawn)]
+    before, after = camera.project(torch.tensor([[-0.3, 0.1, 0.0], [0.5, 0.1, 0.0]]))[0][:, 0].tolist()
+    assert abs(before - after) > 10
+    columns = [mask.any(0).nonzero()[:, 0].float() for mask in ink]
+    radius = 0.4 / 3 * 1.2 * 60 + 3
+    assert float((columns[0] - before).abs().max()) < radius  # heads only
+    assert float((columns[1] - before).abs().min()) < 3  # a tail back to where it came from
+    assert float((columns[1] - after).abs().min()) < 3
+    assert int(ink[1].sum()) > 2 * int(ink[0].sum())
+
+
+def test_what_stands_behind_the_ball_is_not_drawn(cameras):
+    module = known_ball()
+    camera = camera_at(0.75, size=60)
+    paint = Trajectories(module, cameras, count=80)
+    behind = (paint.points - torch.tensor([-0.3, 0.1, 0.0])) @ camera.camera_to_world[:3, 2].float() > 0.2
+    assert int(behind.sum()) > 5
+    paint.points, paint.colors = paint.points[behind], paint.colors[behind]
+    plain, drawn = (next(video(module, [(camera, 0.0)], WHITE, p)) for p in (None, paint))
+    torch.testing.assert_close(plain, drawn)
+
+
+def test_a_still_scene_is_left_as_it_is(cameras):
+    module = known_ball()
+    module.method.trajectories = lambda points, times: points[:, None].expand(-1, len(times), 3)
+    paint = Trajectories(module, cameras)
+    assert len(paint.points) == 0
+    picture = torch.rand(4, 4, 3, generator=torch.Generator().manual_seed(0))
+    assert paint(picture, None, cameras[0], 0.5) is picture
