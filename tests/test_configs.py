@@ -16,6 +16,7 @@ from forewarp.methods.voxel.forward import ForwardWarp
 from forewarp.methods.voxel.structure import VoxelStage
 from forewarp.renderer import Renderer
 from forewarp.runs.build import build_run
+from forewarp.runs.sections import parsed
 from forewarp.scene.box import Lattice
 from forewarp.training.schedule import StageSettings
 from tests.support.configs import CONF, composed, options
@@ -153,7 +154,7 @@ def every_section():
         for j, preset in enumerate(PRESETS):
             names = [f"{model}_{preset}", *([model] if preset == "demo" else [])]
             files = [CONF / "numbers" / f"{name}.yaml" for name in names]
-            texts = [OmegaConf.load(file) for file in files if file.is_file()]
+            texts = [parsed(file.read_text()).content for file in files if file.is_file()]
             own = {experiment for text in texts for experiment in text.get("exceptions", {})}
             for experiment in sorted(own) or [EXPERIMENTS[(3 * i + j) % len(EXPERIMENTS)]]:
                 yield model, preset, experiment

@@ -49,6 +49,7 @@ def test_the_shutter_smears_what_moves_and_only_that_counts_as_moving(made):
     assert away[moving].mean() > 2 * away[~(moving | same)].mean()
 
 
+@pytest.mark.slow
 def test_views_beside_the_path_are_found_in_any_world(made):
     scene = read_scene(made, "truth")  # moved and scaled
     places = {frame.name: frame.camera for frame in scene.val}
@@ -81,6 +82,7 @@ class Perfect:
         return Rendering(rgb.reshape(-1, 3), torch.zeros(len(view)), torch.ones(len(view)))
 
 
+@pytest.mark.slow
 def test_scores_tell_what_moves_from_the_rest(made):
     scene = read_scene(made, "truth")
     small = replace(scene, test=tuple(replace(f, camera=f.camera.resized(18, 32)) for f in scene.test))
