@@ -75,7 +75,7 @@ def test_changes_are_compared_with_the_reference():
 def test_small_runs_are_kept_apart():
     for line in ("ablations SMALL=1", "tables SMALL=1", "effects SMALL=1", "gpu SMALL=1", "demo SMALL=1"):
         sweeps, commands = planned(line)
-        of_ablations = {"budget.minutes=0.03", "budget.iterations=12"}  # whose page has rows by kind of view
+        of_ablations = {"budget.minutes=0.02", "budget.iterations=8"}  # whose page has rows by kind of view
         short = of_ablations if "ablations" in line else {"budget.minutes=0.01", "budget.iterations=4"}
         assert all(len(sweep & short) == 1 for sweep in sweeps)
         assert all("runs/small" in " ".join(words) for words in [*sweeps, *commands])
