@@ -195,6 +195,7 @@ def made_by(config, name, frames=3):
         return run.model(given)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("model", "scene", "published", "parameters"), PUBLISHED)
 def test_faithful_has_the_published_numbers(model, scene, published, parameters):
     config = of_preset("faithful", model, scene)

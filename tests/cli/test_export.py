@@ -30,7 +30,8 @@ def test_it_writes_what_the_run_has_into_its_folder_and_says_so(forewarp, ok, fi
     assert len(PlyData.read(folder / "frames" / "frame_0000.ply")["vertex"]) == about["points"]
     words = ["format=npz", "times=2", "points=20", "views=1", f"out={tmp_path / 'here'}"]
     ok("export", f"run={run}", *words)
-    tracks, scene = np.load(tmp_path / "here" / "trajectories.npz"), load(run)
+    with np.load(tmp_path / "here" / "trajectories.npz") as stored:
+        tracks, scene = dict(stored), load(run)
     wanted = scene.trajectories(scene.matter().points.new_tensor(tracks["points"]), [0.0, 1.0])
     np.testing.assert_allclose(tracks["positions"], wanted, atol=1e-5)
 

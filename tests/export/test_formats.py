@@ -1,5 +1,6 @@
 """What every format refuses; ``format=npz``."""
 
+import contextlib
 import inspect
 from importlib import import_module
 from types import SimpleNamespace
@@ -51,7 +52,9 @@ def test_options_are_arguments_with_defaults_in_the_config_and_limits(kind):
 
 def load(source, tmp_path, **options):
     about = exporter("npz")(source, tmp_path / "npz", **options)
-    return about, *(np.load(tmp_path / "npz" / f"{name}.npz") for name in ("trajectories", "method"))
+    files = (np.load(tmp_path / "npz" / f"{name}.npz") for name in ("trajectories", "method"))
+    with contextlib.ExitStack() as stack:
+        return about, *(dict(stack.enter_context(file)) for file in files)
 
 
 def test_voxels_go_where_the_method_says_and_are_seen_from_their_side(ball, tmp_path):
@@ -74,7 +77,7 @@ def test_voxels_go_where_the_method_says_and_are_seen_from_their_side(ball, tmp_
             assert visible[of_ball, row, column][faces < -1.2].float().mean() < 0.05
     camera = ball.cameras[int(tracks["cameras"][1])]
     np.testing.assert_array_equal(tracks["intrinsics"][1][0], [camera.fx, 0, camera.cx])
-    assert {"radiance.density", "radiance.color"} <= set(method.files)
+    assert {"radiance.density", "radiance.color"} <= method.keys()
 
 
 def test_particles_go_as_their_centers_with_colours_and_opacity_of_each_time(particles, tmp_path):

@@ -91,7 +91,9 @@ def drawn(table, snapshot, camera):
 
 def test_a_viewer_draws_the_images_of_the_run_and_the_motion_moves_the_canonical_file(particles, tmp_path):
     about, folder = export(particles, tmp_path / "ply"), tmp_path / "ply"
-    base, motion = read(folder / "canonical.ply"), np.load(folder / "motion.npz")
+    base = read(folder / "canonical.ply")
+    with np.load(folder / "motion.npz") as stored:
+        motion = dict(stored)
     places = np.stack([base[axis] for axis in "xyz"], -1)
     for number, (time, camera) in enumerate(zip(TIMES, particles.cameras)):
         frame = read(folder / "frames" / f"frame_{number:04d}.ply")
