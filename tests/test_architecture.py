@@ -14,7 +14,7 @@ MAY_IMPORT = {
     "losses": {"ops"},
     **dict.fromkeys(["metrics", "drawing", "fields", "data"], {"ops", "scene"}),
     "report": {"drawing", "metrics"},
-    "synth": {"ops", "scene", "data"},
+    "synth": {"ops", "scene", "data", "drawing"},
     "renderer": {"ops", "scene", "fields"},
     "glb": {"ops", "scene", "fields"},
     "methods": LOWER,

@@ -9,7 +9,7 @@ import torch
 from hydra.utils import instantiate
 from omegaconf import OmegaConf
 
-from forewarp.data import dnerf, hypernerf, nhr, posed_video
+from forewarp.data import dnerf, hypernerf, multicam, nhr, posed_video
 from forewarp.data.module import SceneDataModule
 from forewarp.methods.particles.options import Effects
 from forewarp.methods.voxel.forward import ForwardWarp
@@ -196,6 +196,7 @@ def test_effects_follow_the_images_and_the_command_line_wins():
 
 
 READERS = {"dnerf": dnerf, "hypernerf": hypernerf, "nhr": nhr, "video_with_poses": posed_video}
+READERS |= {"multicam": multicam}
 
 
 @pytest.mark.parametrize("data", READERS)

@@ -14,13 +14,14 @@ from tests.contract.scenes import DATASETS, data_of
 from tests.contract.table import METHODS
 
 TITLES = {"dnerf": "D-NeRF", "hypernerf": "HyperNeRF", "nhr": "NHR", "lego_complete": "Lego Complete"}
+TITLES |= {"multicam": "DyNeRF"}
 WORST = ("failed", "skipped", "not run", "passed")
 HEAD = """# Conformance
 
 What each method was seen to do by the contract suite (`tests/contract`), on one scene of 20 pixels and 6
-times in the format of each dataset: D-NeRF, HyperNeRF, NHR, Lego Complete; what does not depend on the format
-(equal, stopped and killed runs, a voxel stage beside) in D-NeRF's alone. Written by `make conformance`; do
-not edit. How a method joins: [extending](extending.md).
+times in the format of each dataset: D-NeRF, HyperNeRF, NHR, Lego Complete, DyNeRF; what does not depend on
+the format (equal, stopped and killed runs, a voxel stage beside) in D-NeRF's alone. Written by `make
+conformance`; do not edit. How a method joins: [extending](extending.md).
 """
 
 

@@ -1,4 +1,4 @@
-"""Four small scenes, one in the format of each dataset: a coloured ball that slides along x."""
+"""Five small scenes, one in the format of each dataset: a coloured ball that slides along x."""
 
 import math
 from functools import partial
@@ -6,7 +6,8 @@ from functools import partial
 import numpy as np
 import torch
 
-from forewarp.data import dnerf, hypernerf, nhr
+from forewarp.data import dnerf, hypernerf, multicam, nhr
+from forewarp.data.images import write_image
 from forewarp.data.module import SceneDataModule
 from forewarp.scene.camera import Camera, Lens, look_at
 
@@ -91,6 +92,15 @@ def write_nhr(folder):
     nhr.write_scene(folder, cameras, moments())
 
 
+def write_multicam(folder):
+    cameras = [camera_at(k / 4 + 0.05, (SIZE, 16)) for k in range(4)]
+    for k, camera in enumerate(cameras):
+        for t in range(TIMES):
+            rgb = before_wall(photograph(camera, t / (TIMES - 1))[0])
+            write_image(folder / f"cam{k:02d}" / f"{t:04d}.png", rgb)
+    multicam.write_poses(folder, cameras, near=2.0, far=6.0)
+
+
 write_lego_complete = partial(write_dnerf, ability="time")
 
 # name -> what writes a scene into a folder, and what reads it again from root and name.
@@ -99,11 +109,12 @@ DATASETS = {
     "hypernerf": (write_hypernerf, partial(hypernerf.read_scene, scale=1, box=BOX)),
     "nhr": (write_nhr, partial(nhr.read_scene, half_resolution=False, test_views=[0])),
     "lego_complete": (write_lego_complete, dnerf.read_lego_complete),
+    "multicam": (write_multicam, partial(multicam.read_scene, scale=1, box=BOX, normalise=False)),
 }
 
 
 def data_of(dataset, root):
-    """A data module over a scene that was written into ``root/dataset``; of a dome, of 3 views a step."""
-    views = 3 if dataset == "nhr" else 1
+    """A data module over a scene that was written into ``root/dataset``; of a rig, of 3 views a step."""
+    views = 3 if dataset in ("nhr", "multicam") else 1
     read = partial(DATASETS[dataset][1], root, dataset)
     return SceneDataModule(read, rays=192, views_per_step=views, place=root / dataset)

@@ -119,7 +119,7 @@ def test_summary_by_hand():
 BAD_ROWS = [
     (
         ("spcae", {"psnr": 1.0}),
-        "ability: expected one of space, time, canonical, all, moving, still, but got 'spcae'",
+        "ability: expected one of space, time, space_time, canonical, all, moving, still, but got 'spcae'",
     ),
     (("all", {"pnsr": 1.0}), "metric: expected one of psnr, .* but got 'pnsr'"),
     (("all", {"psnr": math.nan}), "psnr: expected a finite score, but got nan"),

@@ -15,6 +15,7 @@ import torch
 from forewarp.data import dnerf, hypernerf, nhr, posed_video
 from forewarp.scene.camera import Camera, Lens, look_at
 from forewarp.scene.frame import Truth
+from forewarp.synth.films import write_scene as write_films
 
 _REAL = Path(os.environ.get("FOREWARP_DATA", Path(__file__).parents[3] / "shared" / "data"))
 GONE = object()
@@ -237,3 +238,31 @@ def placed(scene, camera: Camera) -> Camera:
     space, pose = scene.protocol["normalisation"], camera.camera_to_world.clone()
     pose[:3, 3] = (pose[:3, 3] - torch.tensor(space["center"], dtype=torch.float64)) * space["scale"]
     return replace(camera, camera_to_world=pose)
+
+
+# A rig of fixed cameras with videos -------------------------------------------------------------------------
+
+
+def fixed_cameras(count=4, size=(32, 48)) -> list[Camera]:
+    """Cameras on an arc about ``MIDDLE`` whose middle is theirs; ``size`` is (height, width)."""
+    made, (h, w) = [], size
+    for i in range(count):
+        angle = 0.9 * i / max(count - 1, 1)
+        offset = torch.tensor([np.cos(angle), np.sin(angle), 0.2 + 0.1 * (i % 2)], dtype=torch.float64)
+        pose = look_at(MIDDLE + 20 * offset / offset.norm(), MIDDLE, UP)
+        made.append(Camera(w, h, 1.1 * w, 1.1 * w, w / 2, h / 2, pose, 0.0, 0.0))
+    return made
+
+
+def grey(camera, number, view) -> np.ndarray:
+    """An image whose grey tells its number and, in its left half, its camera's."""
+    image = np.full((camera.height, camera.width, 3), 20 + 20 * number, np.uint8)
+    image[:, : camera.width // 2] = 20 + 20 * view
+    return image
+
+
+def write_multicam(folder: Path, cameras, count=6, **options) -> Path:
+    """Films of six frames by each camera."""
+    films = ([grey(camera, n, k) for n in range(count)] for k, camera in enumerate(cameras))
+    write_films(folder, cameras, films, **{"near": 14.0, "far": 30.0} | options)
+    return folder

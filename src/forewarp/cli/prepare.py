@@ -31,6 +31,7 @@ READERS = {
     "forewarp.data.module.LegoCompleteDataModule": "lego_complete",
     "forewarp.data.module.HyperNeRFDataModule": "hypernerf",
     "forewarp.data.module.NHRDataModule": "nhr",
+    "forewarp.data.module.MulticamDataModule": "multicam",
     "forewarp.data.module.PosedVideoDataModule": "posed_video",
 }
 

@@ -25,6 +25,7 @@ MARKERS = {  # by reader: the file that every scene of its format has
     "hypernerf": "dataset.json",
     "nhr": "CamPose.inf",
     "posed_video": "transforms.json",
+    "multicam": "poses_bounds.npy",
 }
 LAYOUTS = {  # what people call a layout: a file or folder that tells it, and what reads it
     "HyperNeRF": ("dataset.json", "experiment=hypernerf"),
@@ -32,10 +33,7 @@ LAYOUTS = {  # what people call a layout: a file or folder that tells it, and wh
     "D-NeRF": ("transforms_train.json", "experiment=dnerf"),
     "nerfstudio": ("transforms.json", "experiment=video_with_poses"),
     "COLMAP": ("sparse", "forewarp-capture images=<its images> colmap=<its sparse/0>"),
-    "DyNeRF": (
-        "poses_bounds.npy",
-        "a transforms.json with a time in each frame; no reader knows it",
-    ),
+    "DyNeRF": ("poses_bounds.npy", "experiment=multicam"),
 }
 UNREAD = {
     ".webp",
@@ -55,7 +53,7 @@ LOCK = ".lock"  # of every folder of a run
 _UNPRINTABLE = {"Cc", "Cs", "Zl", "Zp"}  # control characters, surrogates, line and paragraph separators
 # What a fingerprint takes: the content of small files, name and size of large ones.
 _READ = {".json", ".inf", ".txt", ".csv"}
-_LISTED = {".png", ".jpg", ".jpeg", ".npy", ".npz", ".ply", ".obj"}
+_LISTED = {".png", ".jpg", ".jpeg", ".npy", ".npz", ".ply", ".obj", ".mp4", ".mov", ".mkv", ".avi", ".webm"}
 
 
 class SceneError(ValueError):

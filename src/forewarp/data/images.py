@@ -80,12 +80,17 @@ class ImageCache:
             return self._kept[key][1]
         with left_out():  # reading images is no training
             made = make()
-        if made.nbytes <= self.limit:
+        self.keep(owner, made)
+        return made
+
+    def keep(self, owner: object, made: Tensor) -> None:
+        """Keep for ``owner`` what was made beside something else."""
+        key = id(owner)
+        if key not in self._kept and made.nbytes <= self.limit:
             # Freed as soon as the owner dies; until then no other object can have its id.
             self._kept[key] = (weakref.ref(owner, lambda _: self._drop(key)), made)
             self.bytes += made.nbytes
             self._shrink()
-        return made
 
     def resize(self, limit: int) -> None:
         """Allow ``limit`` bytes from now on.

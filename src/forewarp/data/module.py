@@ -12,7 +12,7 @@ import torch
 from lightning import LightningDataModule
 from torch import Tensor
 
-from forewarp.data import dnerf, hypernerf, nhr, posed_video
+from forewarp.data import dnerf, hypernerf, multicam, nhr, posed_video
 from forewarp.data.batches import Sampler, Targets, color_of
 from forewarp.data.checks import check_seen
 from forewarp.data.files import RECORD, fingerprint, mismatch, whole
@@ -322,6 +322,17 @@ class NHRDataModule(_FolderDataModule):
         "images of another size than the intrinsics: data.half_resolution=false",
         "point clouds that miss the subject: data.box=[x0,y0,z0,x1,y1,z1]",
         "frames of the cameras that are not of one moment: compare the images of a number",
+    )
+
+
+class MulticamDataModule(_FolderDataModule):
+    """A rig of fixed cameras, as ``multicam.read_scene`` reads it."""
+
+    _reader = _described_by = staticmethod(multicam.read_scene)
+    suspects = (
+        "rows of poses_bounds.npy that belong to other cameras: they are in the order of the videos' names",
+        "cameras that did not begin at one moment: compare the frames of a number",
+        "near and far that miss the subject: data.near, data.far, data.box",
     )
 
 

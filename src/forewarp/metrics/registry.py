@@ -18,7 +18,7 @@ SSIM_LEAST_SIDE, MS_SSIM_LEAST_SIDE, LPIPS_LEAST_SIDE = 11, 161, 32  # pixels
 NETS = "squeeze", "vgg", "alex"  # backbones of LPIPS
 LPIPS_METRICS = tuple(f"lpips_{net}" for net in NETS)
 THRESHOLDS = (1.02, 1.25, 1.25**2)  # ratios of rendered and true depth
-ABILITIES = ("space", "time", "canonical", "all")
+ABILITIES = ("space", "time", "space_time", "canonical", "all")
 PARTS = ("moving", "still")  # of images whose masks say what moves
 
 log = logging.getLogger(__name__)
@@ -262,8 +262,8 @@ def summarise(rows: Iterable[tuple[str, Mapping[str, float]]]) -> dict[str, dict
     """Average the scores of images per ability or part; abilities are never averaged together.
 
     Args:
-        rows: the ability (``space``, ``time``, ``canonical`` or ``all``) or part (``moving``, ``still``) and
-            the scores of each image.
+        rows: the ability (``space``, ``time``, ``space_time``, ``canonical`` or ``all``) or part (``moving``,
+            ``still``) and the scores of each image.
 
     Returns:
         ``{ability or part: {metric: mean}}`` in fixed order. A metric that some images lack is the mean over

@@ -55,7 +55,12 @@ NUMBERS += ("psnr_canonical", "size", "wall", "processor")
 TEXTS = ("dataset", "day", "commit", "departures", "faults", "views", "curve", "command")
 # Kinds of test view, and parts of their pixels, that scores are of.
 KINDS = {"space": "at training times", "time": "between training times", "canonical": "at the canonical time"}
-KINDS |= {"all": "all", "moving": "what moves", "still": "what is still"}
+KINDS |= {
+    "space_time": "of cameras and between times held out",
+    "all": "all",
+    "moving": "what moves",
+    "still": "what is still",
+}
 COUNTERPART = "counterpart of "  # begins the dataset of synthetic scenes that stand in for its own
 NETS = ("vgg", "alex", "squeeze")  # LPIPS in tables is of the first whose weights were there
 PROTOCOL = (
@@ -66,6 +71,8 @@ PROTOCOL = (
     "views",
     "train_frames",
     "test_views",
+    "test_cameras",
+    "test_moments",
     "test_frames",
 )
 PROTOCOL += ("measured", "held_out", "canonical_time", "mask_box")  # what pages tell of a run's protocol

@@ -22,9 +22,10 @@ class Frame:
     ``load()`` gives the image as a uint8 tensor (H, W, 4), straight (not premultiplied) alpha, at the
     camera's size; without an alpha channel on disk alpha is 255. ``load_depth()``, if not None,
     gives exact ray depth (H, W) float32 in world units, 0 on the background. ``ability`` is what a test
-    frame measures: ``space``, ``time``, ``canonical``, or ``all`` if the dataset does not say.
-    ``camera_id`` numbers the physical cameras from 0, if the dataset tells them apart. ``load_valid()``, if
-    not None, gives (H, W) bool: the pixels, at least one, that count in training and in metrics.
+    frame measures: ``space``, ``time``, ``space_time`` (both), ``canonical``, or ``all`` if the dataset does
+    not say. ``camera_id`` numbers the physical cameras from 0, if the dataset tells them apart.
+    ``load_valid()``, if not None, gives (H, W) bool: the pixels, at least one, that count in training and in
+    metrics.
     ``load_moving()``, if not None, gives (H, W) bool: the pixels of what moves, which are scored apart.
     """
 

@@ -1,0 +1,398 @@
+"""Rigs of fixed cameras in the layout of DyNeRF (Neural 3D Video): a video for each camera, and their poses.
+
+``poses_bounds.npy`` has a row of 17 numbers for each camera, in the order of the videos' names: 3 x 5 numbers
+[R | T | (height, width, focal length)], row by row, and the depths of the nearest and the farthest matter.
+[R|T] is camera-to-world, the axes of a camera are LLFF's: down, right, backwards. The middle of an image is
+its principal point.
+
+A camera is a video ``cam00.mp4``, or a folder of its frames ``cam00/`` or ``cam00/images/``, as preprocessors
+leave them; a folder goes before a video. All cameras film at once: frame n of each is moment n.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from forewarp.data.arrays import load_numpy
+from forewarp.data.cameras import MOST_UNITS, box_of, pose_of, space_of
+from forewarp.data.directions import inverted, other_readings
+from forewarp.data.files import mismatch, number, scene_folder, whole
+from forewarp.data.images import (
+    CACHE,
+    SUFFIXES,
+    TURN,
+    StoredImage,
+    by,
+    common_header,
+    in_order,
+    inspect_image,
+    reduced,
+    turned_by_exif,
+)
+from forewarp.data.rigs import held_cameras, held_moments, split_rig
+from forewarp.data.video import extracted, stamps_of
+from forewarp.files import written_whole
+from forewarp.scene.camera import Camera
+from forewarp.scene.frame import Frame, Scene, middle_of
+
+FILE = "poses_bounds.npy"
+_SUFFIXES = (".mp4", ".mov", ".mkv", ".avi", ".webm")
+_MOST_APART = 0.5  # frames by which two videos may run apart
+# A camera's axes down, right, backwards to OpenCV's, and back.
+_AXES = torch.tensor([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]], dtype=torch.float64)
+_READINGS = {  # what else may be in a row
+    "they are world-to-camera": lambda poses: inverted(poses @ _AXES) @ _AXES,
+    "the axes are OpenCV's": lambda poses: poses @ _AXES,
+}
+
+
+@dataclass(frozen=True)
+class _Row:
+    """A row of the file: ``pose`` (4, 4) with OpenCV's axes, ``size`` (width, height), focal length in
+    pixels, and the depths of the nearest and the farthest matter.
+    """
+
+    pose: Tensor
+    size: tuple[int, int]
+    focal: float
+    near: float
+    far: float
+
+
+@dataclass(frozen=True)
+class _Track:
+    """What a camera took: a video at ``path``, or ``images`` in a folder, ``size`` (width, height) on disk.
+
+    ``stamps`` are the seconds of a video's frames, None of a folder.
+    """
+
+    path: Path
+    size: tuple[int, int]
+    stamps: np.ndarray | None = None
+    images: tuple[Path, ...] = ()
+
+    def __len__(self) -> int:
+        return len(self.images) if self.stamps is None else len(self.stamps)
+
+    def name(self, moment: int) -> str:
+        """Name a frame by its file or its number."""
+        return f"{self.path.stem}/{self.images[moment].stem if self.images else f'{moment:04d}'}"
+
+
+class ReducedImage(StoredImage):
+    """An opaque image whose blocks of ``factor`` x ``factor`` pixels are averaged."""
+
+    def __init__(self, path: Path, size: tuple[int, int], factor: int) -> None:
+        super().__init__(path, size, opaque=True)
+        self.factor = factor
+
+    def _decode(self) -> Tensor:
+        return reduced(super()._decode(), self.factor)
+
+
+class Film:
+    """A video whose frames are decoded when they are needed.
+
+    Args:
+        path: of the video.
+        stamps: seconds of its frames.
+        size: (width, height), what each has.
+        factor: average blocks of so many pixels a side.
+        bytes_of_all: of the decoded frames of all cameras. Where there is room to keep them, the first frame
+            that is needed has all of its video decoded; else each is sought in the file, which takes a tenth
+            of a second and more.
+    """
+
+    def __init__(
+        self, path: Path, stamps: np.ndarray, size: tuple[int, int], factor: int, bytes_of_all: int
+    ) -> None:
+        self.path, self.stamps, self.size, self.factor = path, stamps, size, factor
+        self.bytes_of_all = bytes_of_all
+        self.images = tuple(FilmImage(self, number) for number in range(len(stamps)))
+
+    def decoded(self, start: int, count: int) -> Iterator[Tensor]:
+        """Decode ``count`` frames from number ``start`` on: uint8 (H, W, 4) each, alpha 255.
+
+        Raises:
+            SceneError: where one is not there, or of another size.
+        """
+        gap = float(np.diff(self.stamps).min()) if len(self.stamps) > 1 else 1.0
+        after = None if start == 0 else float(self.stamps[start]) - gap / 2
+        images = extracted(self.path, None, None, start=after)
+        for index in range(start, start + count):
+            pixels = next(images, None)
+            if pixels is None:
+                expected = f"{len(self.stamps)} frames, as its index says"
+                raise mismatch(self.path, expected, index, "convert the video")
+            if pixels.shape[1::-1] != self.size:
+                raise mismatch(f"{self.path}: frame {index}", by(self.size), by(pixels.shape[1::-1]))
+            opaque = np.full((*pixels.shape[:2], 4), 255, np.uint8)
+            opaque[..., :3] = pixels
+            yield reduced(torch.from_numpy(opaque), self.factor)
+        images.close()
+
+
+class FilmImage:
+    """Frame ``number`` of a film, uint8 (H, W, 4); kept while there is room, and read-only."""
+
+    def __init__(self, film: Film, number: int) -> None:
+        self.film, self.number = film, number
+
+    def __call__(self) -> Tensor:
+        """Give the pixels; SceneError as ``Film.decoded``."""
+        return CACHE.get(self, self._decode)
+
+    def _decode(self) -> Tensor:
+        if self.film.bytes_of_all > CACHE.limit:
+            (pixels,) = self.film.decoded(self.number, 1)
+            return pixels
+        for image, pixels in zip(self.film.images, self.film.decoded(0, len(self.film.images))):
+            if image is self:
+                own = pixels
+            else:
+                CACHE.keep(image, pixels)
+        return own
+
+
+def read_scene(
+    root: str | Path,
+    scene: str,
+    *,
+    scale: int = 2,
+    frames: int | None = None,
+    test_cameras: Sequence[str] | None = None,
+    test_moments: Sequence[int] | None = None,
+    test_every: int = 1,
+    near: float | None = None,
+    far: float | None = None,
+    box: Sequence[float] | None = None,
+    normalise: bool = True,
+) -> Scene:
+    """Read ``root/scene``; frames are decoded when they are first loaded.
+
+    Args:
+        scale: average blocks of so many pixels a side, of images as large as the file says. Frames that a
+            preprocessor has made smaller are averaged less.
+        frames: how many moments, from the first; None: all. The first is at the time 0, the last at 1.
+        test_cameras: names of the cameras held out; None: the first.
+        test_moments: numbers of the moments, from 0, that no camera is trained on; None: none.
+        test_every: measure held-out cameras at every n-th moment only.
+        near, far: along the unit ray, the file's units; None: what holds all depths of the file.
+        box: x0 y0 z0 x1 y1 z1 in the file's units; None takes all that the cameras see from near to far.
+        normalise: put what is looked at into the origin and the farthest camera at distance 1.
+
+    Raises:
+        SceneError: for every file or value that is missing or wrong, with file and row.
+
+    Cost: a pass over each video that decodes its first frame alone; a small read of each image.
+    """
+    folder = scene_folder(root, scene, "multicam")
+    if not isinstance(normalise, bool):
+        raise mismatch("data.normalise", "true or false", repr(normalise))
+    scale, every = whole(scale, "data.scale", 1), whole(test_every, "data.test_every", 1)
+    paths = _paths(folder)
+    rows = _read_rows(folder / FILE, list(paths))
+    tracks = [_look(path) for path in paths.values()]
+    count, assumed = _moments(tracks, None if frames is None else whole(frames, "data.frames", 1), folder)
+    turned = [path for track in tracks for path in track.images[:count] if inspect_image(path).is_turned]
+    assumed += turned_by_exif(turned, folder)
+    held, moments = held_cameras(test_cameras, list(paths), [0]), held_moments(test_moments, count)
+    factors = [_factor(track, row, scale) for track, row in zip(tracks, rows)]
+    cameras = [_camera(row, scale) for row in rows]
+    bytes_of_all = 4 * count * sum(camera.width * camera.height for camera in cameras)
+    loads = []
+    for track, factor in zip(tracks, factors):
+        if track.stamps is None:
+            loads.append([ReducedImage(path, track.size, factor) for path in track.images[:count]])
+        else:
+            loads.append(Film(track.path, track.stamps[:count], track.size, factor, bytes_of_all).images)
+    aslant = max(math.hypot(1, math.hypot(c.width / c.fx, c.height / c.fy) / 2) for c in cameras)
+    near = min(row.near for row in rows) if near is None else number(near, "data.near", 0, MOST_UNITS)
+    far = aslant * max(row.far for row in rows) if far is None else number(far, "data.far", 0, MOST_UNITS)
+    given = None if box is None else box_of(box)
+    space, seen = space_of(cameras, str(folder / FILE), near=near, far=far, box=given, normalise=normalise)
+    cameras = [space.camera(camera) for camera in cameras]
+
+    def view(moment: int, k: int) -> Frame:
+        time = moment / max(count - 1, 1)
+        return Frame(tracks[k].name(moment), time, cameras[k], loads[k][moment], camera_id=k)
+
+    taken = ((moment, view(moment, k)) for moment in range(count) for k in range(len(cameras)))
+    train, test = split_rig(taken, held, moments, every)
+    sizes = sorted({(camera.width, camera.height) for camera in cameras}, reverse=True)
+    protocol = {
+        "dataset": "multicam",
+        "resolution": list(sizes[0]) if len(sizes) == 1 else [list(size) for size in sizes],
+        "scale": scale,
+        "frames": count,
+        "views": len(cameras),
+        "test_cameras": [list(paths)[k] for k in held],
+        "test_moments": sorted(moments),
+        "test_frames": len(test),
+        "normalisation": {"center": list(space.center), "scale": space.scale},
+        "near": space.near,
+        "far": space.far,
+    }
+    stamps = next((track.stamps for track in tracks if track.stamps is not None), None)
+    if stamps is not None and count > 1:
+        protocol["seconds"] = float(stamps[count - 1] - stamps[0])
+    if assumed:
+        protocol["assumed"] = assumed
+    return Scene(scene, train, (), test, seen, middle_of([f.time for f in train]), False, protocol=protocol)
+
+
+def write_poses(folder: str | Path, cameras: Sequence[Camera], *, near: float, far: float) -> None:
+    """Write ``poses_bounds.npy``; films are written by ``synth.films.write_scene``.
+
+    Args:
+        folder: of the scene.
+        cameras: which the format can tell: square pixels, no lens, the principal point in the middle.
+        near, far: depths of the nearest and the farthest matter, in the units of the cameras' places.
+
+    Raises:
+        SceneError: for another camera.
+    """
+    rows = []
+    for k, camera in enumerate(cameras):
+        is_told = camera.lens is None and camera.skew == 0 and camera.fx == camera.fy
+        if not is_told or (camera.cx, camera.cy) != (camera.width / 2, camera.height / 2):
+            expected = "square pixels, the principal point in the middle and no lens"
+            raise mismatch(f"camera {k}", expected, "another camera", "undistort and crop the images")
+        inner = torch.tensor([[camera.height], [camera.width], [camera.fx]], dtype=torch.float64)
+        pose = camera.camera_to_world.double() @ _AXES
+        rows.append([*torch.cat([pose[:3], inner], 1).flatten().tolist(), near, far])
+    with written_whole(Path(folder) / FILE) as beside:
+        np.save(beside, np.array(rows))
+
+
+def _paths(folder: Path) -> dict[str, Path]:
+    """Find the video or the folder of frames of each camera, by name, in the order of numbers."""
+    found = {path.stem: path for path in folder.glob("cam*") if path.suffix.lower() in _SUFFIXES}
+    for path in folder.glob("cam*/"):
+        inner = next((place for place in (path, path / "images") if _images(place)), None)
+        found |= {} if inner is None else {path.name: inner}
+    if not found:
+        expected = "a video for each camera, cam00.mp4, or a folder of its frames, cam00/"
+        raise mismatch(folder, expected, "neither")
+    return {name: found[name] for name in in_order(found)}
+
+
+def _images(folder: Path) -> list[Path]:
+    there = folder.glob("[!.]*") if folder.is_dir() else ()
+    return in_order((path for path in there if path.suffix in SUFFIXES), lambda path: path.name)
+
+
+def _read_rows(path: Path, names: Sequence[str]) -> list[_Row]:
+    """Read and check a row for each camera.
+
+    Raises:
+        SceneError: naming the row, or saying in which other way poses seem to be written.
+    """
+    array = load_numpy(path)
+    shape, advice = getattr(array, "shape", ()), "write them as LLFF does"
+    if len(shape) != 2 or shape[1] != 17 or array.dtype.kind not in "iuf":
+        raise mismatch(path, "17 numbers for each camera", f"shape {shape}", advice)
+    if len(array) != len(names):
+        expected = f"a row for each of {len(names)} cameras, {names[0]} to {names[-1]}"
+        advice = "remove the row or the camera that the other lacks"
+        raise mismatch(path, expected, f"{len(array)} rows", advice)
+    rows = []
+    for k, (name, values) in enumerate(zip(names, np.array(array, np.float64))):
+        where = f"{path}: row {k} ({name})"
+        block, (near, far) = values[:15].reshape(3, 5), values[15:].tolist()
+        pose = torch.from_numpy(pose_of((np.vstack([block[:, :4], [0, 0, 0, 1]]) @ _AXES.numpy()), where))
+        height, width, focal = block[:, 4].tolist()
+        sizes = [number(side, f"{where}: height and width", 1, 1e6) for side in (height, width)]
+        if any(side % 1 for side in sizes):
+            raise mismatch(f"{where}: height and width", "whole numbers", f"{height:g} and {width:g}")
+        focal = number(focal, f"{where}: focal length", 0.01 * width, 100 * width)
+        if (
+            not 0
+            < number(near, f"{where}: near", 0, MOST_UNITS)
+            < number(far, f"{where}: far", 0, MOST_UNITS)
+        ):
+            raise mismatch(f"{where}: bounds", "0 < near < far", f"{near:g} and {far:g}")
+        rows.append(_Row(pose, (int(width), int(height)), focal, near, far))
+    if ways := other_readings([row.pose for row in rows], _READINGS):
+        expected = "[R | T] camera-to-world with the axes down, right, backwards"
+        got = f"cameras that look at one thing only if {', or if '.join(ways)}"
+        raise mismatch(path, expected, got, "convert them")
+    return rows
+
+
+def _look(path: Path) -> _Track:
+    """Find the size and number of a camera's frames."""
+    if path.is_dir():
+        images = tuple(_images(path))
+        place = path.parent if path.name == "images" else path
+        return _Track(place, common_header(images).size, None, images)
+    stamps = stamps_of(path)
+    first = next(extracted(path, [0], None), None) if len(stamps) else None
+    if first is None:
+        raise mismatch(path, "a video", "another file", "copy it again")
+    return _Track(path, first.shape[1::-1], stamps)
+
+
+def _moments(tracks: Sequence[_Track], most: int | None, folder: Path) -> tuple[int, list[str]]:
+    """Count the moments that all cameras have, ``most`` at most; say in a line where some have more.
+
+    Raises:
+        SceneError: naming a camera whose frames are of other times than the first's, or numbered otherwise.
+    """
+    lengths = [len(track) if most is None else min(len(track), most) for track in tracks]
+    count, assumed = min(lengths), []
+    if count < max(lengths):
+        least = tracks[lengths.index(count)].path.name
+        line = f"{folder}: {least} has {count} frames, others up to {max(lengths)}: all are cut to the first"
+        assumed = [f"{line} {count}"]
+    films = [track for track in tracks if track.stamps is not None]
+    for film in films[1:] if count > 1 else ():
+        mine, first = ((f.stamps[:count] - f.stamps[0]) for f in (film, films[0]))
+        apart = np.abs(mine - first) * (count - 1) / first[-1]  # in frames
+        if apart.max() > _MOST_APART:
+            rates = [(count - 1) / seconds[-1] for seconds in (first, mine)]
+            at = int((apart > _MOST_APART).argmax())
+            expected = f"frames at the times of {films[0].path.name}, {rates[0]:.4g} a second"
+            got = f"{rates[1]:.4g} a second, {abs(mine[at] - first[at]):.3g} s apart at frame {at}"
+            raise mismatch(film.path, expected, got, "convert all to one constant rate, or remove the camera")
+    folders = [track for track in tracks if track.images]
+    for track in folders[1:]:
+        for mine, first in zip(track.images[:count], folders[0].images):
+            here, there = (re.search(r"\d*$", path.stem)[0].lstrip("0") for path in (mine, first))
+            if here != there:
+                expected = f"a frame of the number of {folders[0].path.name}/{first.name}"
+                advice = "remove a frame that one camera lacks from all"
+                raise mismatch(track.path, expected, mine.name, advice)
+    return count, assumed
+
+
+def _factor(track: _Track, row: _Row, scale: int) -> int:
+    """Return by how much a camera's frames are to be reduced."""
+    if any(side % scale for side in row.size):
+        raise mismatch("data.scale", f"a divisor of both sides of {by(row.size)} pixels", scale)
+    fitting = {
+        tuple(side // n for side in row.size): scale // n for n in range(1, scale + 1) if scale % n == 0
+    }
+    if track.size not in fitting:
+        smaller = row.size[0] // track.size[0]
+        is_smaller = smaller > 1 and tuple(side // smaller for side in row.size) == track.size
+        advice = f"set data.scale={smaller}" if is_smaller else ""
+        advice = TURN if track.size[::-1] in fitting else advice
+        expected = f"{' or '.join(map(by, fitting))} pixels as {FILE} and data.scale={scale} say"
+        raise mismatch(track.path, expected, by(track.size), advice)
+    return fitting[track.size]
+
+
+def _camera(row: _Row, scale: int) -> Camera:
+    """Make the camera of images reduced by ``scale``, its near and far 0."""
+    width, height = (side // scale for side in row.size)
+    focal = row.focal / scale
+    return Camera(width, height, focal, focal, width / 2, height / 2, row.pose, 0.0, 0.0)

@@ -1,0 +1,83 @@
+"""Hold out cameras and moments of a rig: cameras with names that film together, moment by moment."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Sequence
+from dataclasses import replace
+from reprlib import repr as short
+
+from forewarp.data.files import mismatch
+from forewarp.scene.frame import Frame
+
+_SHOWN = 6  # names of cameras in an error
+
+
+def held_cameras(
+    wanted: Sequence[str | int] | None, names: Sequence[str], default: Iterable[int]
+) -> list[int]:
+    """Find the cameras to hold out, their ascending places in ``names``.
+
+    Args:
+        wanted: names, not of all cameras; None: see ``default``.
+        names: of the cameras.
+        default: places of those that are held out where nothing is wanted.
+
+    Raises:
+        SceneError: for anything else.
+
+    >>> held_cameras(["cam02"], ["cam00", "cam02", "cam13"], [0])
+    [1]
+    """
+    if wanted is None:
+        return sorted(default)
+    are_names = isinstance(wanted, Sequence) and not isinstance(wanted, str)
+    texts = [str(name) for name in wanted] if are_names else [""]
+    if not {*texts} <= {*names} or len({*texts}) < len(texts) or len(texts) >= len(names):
+        there = ", ".join(names) if len(names) <= _SHOWN else f"{names[0]}, {names[1]} .. {names[-1]}"
+        raise mismatch("data.test_cameras", f"different cameras of {there}, not all", short(wanted))
+    return sorted(names.index(text) for text in texts)
+
+
+def held_moments(wanted: Sequence[int] | None, count: int) -> frozenset[int]:
+    """Check the moments to hold out, numbers below ``count``, not all; None: there are none.
+
+    >>> sorted(held_moments([3, 1], 5))
+    [1, 3]
+    """
+    are_numbers = wanted is None or (
+        isinstance(wanted, Sequence) and all(type(n) is int and 0 <= n < count for n in wanted)
+    )
+    if not are_numbers or len({*(wanted or ())}) >= count:
+        raise mismatch("data.test_moments", f"numbers of 0 to {count - 1}, not all", short(wanted))
+    return frozenset(wanted or ())
+
+
+def split_rig(
+    frames: Iterable[tuple[int, Frame]], cameras: Collection[int], moments: Collection[int], every: int = 1
+) -> tuple[tuple[Frame, ...], tuple[Frame, ...]]:
+    """Part frames into those to train on and those to test on; their order stays.
+
+    A test frame measures ``space`` if only its camera is held out, ``time`` if only its moment is, and
+    ``space_time`` if both are.
+
+    Args:
+        frames: each with the number of its moment.
+        cameras: ids of those held out.
+        moments: numbers of those held out.
+        every: test held-out cameras at every n-th moment alone; held-out moments are all tested.
+
+    Raises:
+        SceneError: where nothing is left to test on.
+    """
+    train, test = [], []
+    for moment, frame in frames:
+        kinds = [("space", frame.camera_id in cameras), ("time", moment in moments)]
+        ability = "_".join(kind for kind, is_held in kinds if is_held)
+        if not ability:
+            train.append(frame)
+        elif ability != "space" or moment % every == 0:
+            test.append(replace(frame, ability=ability))
+    if not test:
+        advice = "name some in data.test_cameras or data.test_moments"
+        raise mismatch("data.test_cameras", "a camera or a moment to test on", "none", advice)
+    return tuple(train), tuple(test)

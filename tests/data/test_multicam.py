@@ -1,0 +1,268 @@
+"""Rigs of fixed cameras in the layout of DyNeRF: videos or folders of frames, and poses_bounds.npy."""
+
+import shutil
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from forewarp.data.batches import Sampler
+from forewarp.data.files import SceneError
+from forewarp.data.images import CACHE, write_image
+from forewarp.data.module import MulticamDataModule
+from forewarp.data.multicam import FILE, read_scene, write_poses
+from forewarp.data.rigs import held_cameras
+from forewarp.synth.films import write_scene
+from tests.support.films import numbered, write_film
+from tests.support.written_scenes import fixed_cameras, grey, placed, write_multicam
+
+CAMERAS = fixed_cameras(3)
+
+
+@pytest.fixture(scope="module")
+def films(tmp_path_factory):
+    """The root of a rig of videos, which no test changes."""
+    root = tmp_path_factory.mktemp("films")
+    write_multicam(root / "toy", CAMERAS[:2], count=4)
+    return root
+
+
+@pytest.fixture(scope="module")
+def frames(tmp_path_factory):
+    """The root of a rig of three cameras whose six frames are images in folders."""
+    root = tmp_path_factory.mktemp("frames")
+    for k, camera in enumerate(CAMERAS):
+        for n in range(6):
+            write_image(root / "toy" / f"cam{k:02d}" / f"{n:04d}.png", grey(camera, n, k))
+    write_poses(root / "toy", CAMERAS, near=14.0, far=30.0)
+    return root
+
+
+@pytest.fixture
+def folder(frames, tmp_path):
+    """A copy to change."""
+    return shutil.copytree(frames / "toy", tmp_path / "toy")
+
+
+def tells(image):
+    """The numbers of the camera and the frame that ``grey`` tells."""
+    return [round((float(image[..., x, 0].float().mean()) - 20) / 20) for x in (2, -2)]
+
+
+def test_films_are_read_as_a_rig_whose_first_camera_is_held_out(films):
+    scene = read_scene(films, "toy")
+    assert [f.name for f in scene.test] == [f"cam00/{n:04d}" for n in range(4)]
+    assert {f.ability for f in scene.test} == {"space"}
+    assert [(f.camera_id, f.time) for f in scene.train] == [(1, n / 3) for n in range(4)]
+    assert [tells(f.load()) for f in scene.train] == [[1, n] for n in range(4)]
+    expected = {"dataset": "multicam", "resolution": [24, 16], "scale": 2, "frames": 4, "views": 2}
+    expected |= {"test_cameras": ["cam00"], "test_moments": [], "test_frames": 4}
+    assert expected.items() <= scene.protocol.items()
+    assert scene.protocol["seconds"] == pytest.approx(3 / 30, abs=1e-3)
+    assert "assumed" not in scene.protocol
+    for frame in (scene.test[0], scene.train[0]):
+        camera = placed(scene, CAMERAS[frame.camera_id])
+        torch.testing.assert_close(frame.camera.camera_to_world, camera.camera_to_world)
+        assert frame.camera.fx == frame.camera.fy == CAMERAS[0].fx / 2
+    assert float(scene.test[0].camera.center.norm()) == pytest.approx(1)
+
+
+@pytest.mark.slow
+def test_where_not_all_frames_fit_each_is_sought_in_its_film(films, monkeypatch):
+    whole = [frame.load() for frame in read_scene(films, "toy").train]
+    monkeypatch.setattr(CACHE, "limit", 2000)
+    for frame, expected in zip(read_scene(films, "toy").train, whole):
+        torch.testing.assert_close(frame.load(), expected, rtol=0, atol=0)
+
+
+def test_axes_of_a_row_are_down_right_backwards(frames, tmp_path):
+    shutil.copytree(frames / "toy", tmp_path / "toy")
+    row = [0, 1, 0, 0, 32, -1, 0, 0, 0, 48, 0, 0, 1, 5, 60, 2, 9]  # at (0, 0, 5), y up, looking along -z
+    np.save(tmp_path / "toy" / FILE, np.array([row] * 3) + np.arange(3)[:, None] * (np.arange(17) == 3))
+    pose = read_scene(tmp_path, "toy", normalise=False, scale=1).test[0].camera.camera_to_world
+    assert pose.tolist() == [[1, 0, 0, 0], [0, -1, 0, 0], [0, 0, -1, 5], [0, 0, 0, 1]]
+
+
+def test_folders_of_frames_go_before_films_and_may_be_smaller(frames, tmp_path):
+    write_poses(tmp_path / "toy", CAMERAS, near=14.0, far=30.0)
+    for k, camera in enumerate(CAMERAS):
+        small = camera.resized(24, 16)
+        for n in range(4):
+            write_image(tmp_path / "toy" / f"cam{k:02d}" / "images" / f"{n:04d}.png", grey(small, n, 9 - k))
+        (tmp_path / "toy" / f"cam{k:02d}.mp4").touch()
+    half, quarter = read_scene(tmp_path, "toy"), read_scene(tmp_path, "toy", scale=4)
+    assert half.protocol["resolution"] == [24, 16]
+    assert quarter.protocol["resolution"] == [12, 8]
+    assert [tells(scene.train[-1].load()) for scene in (half, quarter)] == [[7, 3]] * 2
+    assert half.train[-1].name == "cam02/0003"
+    large = read_scene(frames, "toy", scale=1).train[0]
+    assert (large.load().shape, large.camera.fx) == ((32, 48, 4), CAMERAS[0].fx)
+
+
+def test_cameras_and_moments_are_held_out_by_name_and_told_apart(frames):
+    scene = read_scene(frames, "toy", test_cameras=["cam02"], test_moments=[1, 4], test_every=2)
+    kinds = {
+        kind: [f.name for f in scene.test if f.ability == kind] for kind in ("space", "time", "space_time")
+    }
+    assert kinds == {
+        "space": ["cam02/0000", "cam02/0002"],
+        "time": ["cam00/0001", "cam01/0001", "cam00/0004", "cam01/0004"],
+        "space_time": ["cam02/0001", "cam02/0004"],
+    }
+    assert [f.name for f in scene.train] == [f"cam{k:02d}/{n:04d}" for n in (0, 2, 3, 5) for k in (0, 1)]
+    only = read_scene(frames, "toy", test_cameras=[], test_moments=[3])
+    assert {f.name for f in only.test} == {"cam00/0003", "cam01/0003", "cam02/0003"}
+    assert len(read_scene(frames, "toy", frames=3).train) == 6
+
+
+def test_a_step_has_several_cameras_of_one_moment(frames):
+    data = MulticamDataModule(frames, "toy", views_per_step=2, rays=8)
+    assert isinstance(data.batches, Sampler)
+    for _ in range(4):
+        moments = [observation.moment for observation in data.batches.draw().observations]
+        assert {moment.camera for moment in moments} == {1, 2}
+        assert len({moment.time for moment in moments}) == 1
+
+
+def test_cameras_of_other_lengths_are_cut_to_the_shortest(folder):
+    (folder / "cam01" / "0005.png").unlink()
+    scene = read_scene(folder.parent, "toy")
+    assert scene.times == (0.0, 0.25, 0.5, 0.75, 1.0)
+    line = f"{folder}: cam01 has 5 frames, others up to 6: all are cut to the first 5"
+    assert scene.protocol["assumed"] == [line]
+    assert "assumed" not in read_scene(folder.parent, "toy", frames=5).protocol
+
+
+def rows(change):
+    """A change of poses_bounds.npy."""
+
+    def harm(folder):
+        np.save(folder / FILE, change(np.load(folder / FILE)))
+
+    return harm
+
+
+def written(name, size=(32, 48)):
+    """A change that writes an image."""
+    return lambda folder: write_image(folder / name, np.zeros((*size, 3), np.uint8))
+
+
+def opencv(array):
+    """The same cameras with OpenCV's axes."""
+    blocks = array[:, :15].reshape(-1, 3, 5).copy()
+    blocks[..., [0, 1]] = blocks[..., [1, 0]]
+    blocks[..., 2] *= -1
+    return np.concatenate([blocks.reshape(-1, 15), array[:, 15:]], 1)
+
+
+def set_to(row, column, value):
+    def change(array):
+        array[row, column] = value
+        return array
+
+    return rows(change)
+
+
+BAD = [
+    (
+        rows(lambda a: a[:2]),
+        rf"{FILE}: expected a row for each of 3 cameras, cam00 to cam02, but got 2 rows; rem",
+    ),
+    (rows(lambda a: a[:, :15]), r"npy: expected 17 numbers for each camera, but got shape \(3, 15\)"),
+    (
+        lambda folder: (folder / FILE).write_bytes(b"text"),
+        "npy: expected a NumPy file, but got one that cannot",
+    ),
+    (set_to(1, 3, np.nan), r"row 1 \(cam01\): expected 4 x 4 or 3 x 4 finite numbers"),
+    (set_to(1, 0, 3), r"row 1 \(cam01\): expected a rotation"),
+    (set_to(2, 14, 0), r"row 2 \(cam02\): focal length: expected a number in \[0.48, 4800\], but got 0"),
+    (set_to(2, 9, 48.5), r"row 2 \(cam02\): height and width: expected whole numbers, but got 32 and 48.5"),
+    (set_to(2, 16, 3), r"row 2 \(cam02\): bounds: expected 0 < near < far, but got 14 and 3"),
+    (set_to(2, 9, 50), "cam02: expected 50 x 32 or 25 x 16 pixels as .* say, but got 48 x 32"),
+    (
+        lambda folder: [shutil.rmtree(place) for place in folder.glob("cam*")],
+        "expected a video for each camera",
+    ),
+    (written("cam01/0003.png", (16, 24)), "0003.png: expected 48 x 32 pixels as the first, but got 24 x 16"),
+    (
+        lambda folder: (folder / "cam01" / "0003.png").rename(folder / "cam01" / "0013.png"),
+        "cam01: expected a frame of the number of cam00/0003.png, but got 0004.png; remove a frame that",
+    ),
+]
+
+
+@pytest.mark.parametrize(("harm", "match"), BAD)
+def test_a_harmed_rig_is_refused_in_a_line(folder, harm, match):
+    harm(folder)
+    with pytest.raises(SceneError, match=match) as caught:
+        read_scene(folder.parent, "toy")
+    assert "\n" not in str(caught.value)
+    assert str(folder) in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("options", "match"),
+    [
+        ({"scale": 3}, "data.scale: expected a divisor of both sides of 48 x 32 pixels, but got 3"),
+        ({"scale": 0}, "data.scale: expected a whole number of at least 1, but got 0"),
+        ({"frames": 0}, "data.frames: expected a whole number of at least 1, but got 0"),
+        (
+            {"test_cameras": ["cam07"]},
+            r"data.test_cameras: .* cameras of cam00, cam01, cam02, not all, but got \['cam07'\]",
+        ),
+        ({"test_cameras": "cam00"}, "data.test_cameras: expected different cameras"),
+        ({"test_cameras": ["cam00", "cam01", "cam02"]}, "data.test_cameras: .* not all"),
+        (
+            {"test_cameras": []},
+            "expected a camera or a moment to test on, but got none; name some in data.test",
+        ),
+        ({"test_moments": [6]}, r"data.test_moments: expected numbers of 0 to 5, not all, but got \[6\]"),
+        ({"test_moments": [0, 1, 2, 3, 4, 5]}, "data.test_moments: expected numbers"),
+        ({"near": 20, "far": 3}, "expected near < far, but got 20 and 3"),
+        ({"normalise": "no"}, "data.normalise: expected true or false, but got 'no'"),
+        ({"box": [1, 2]}, "data.box: expected six numbers"),
+    ],
+)
+def test_bad_options_are_refused_in_a_line(frames, options, match):
+    with pytest.raises(SceneError, match=match):
+        read_scene(frames, "toy", **options)
+
+
+def test_poses_in_other_axes_are_named(tmp_path):
+    """Of four cameras and more it can be told."""
+    (tmp_path / "toy").mkdir()
+    for k, camera in enumerate(cameras := fixed_cameras(4)):
+        write_image(tmp_path / "toy" / f"cam{k:02d}" / "0.png", grey(camera, 0, k))
+    blocks = [np.c_[c.camera_to_world[:3].numpy(), [c.height, c.width, c.fx]].flatten() for c in cameras]
+    np.save(tmp_path / "toy" / FILE, np.c_[np.array(blocks), [[14.0, 30.0]] * 4])
+    with pytest.raises(SceneError, match="look at one thing only if the axes are OpenCV's; convert them"):
+        read_scene(tmp_path, "toy")
+
+
+def test_names_of_many_cameras_are_shortened():
+    with pytest.raises(SceneError, match="different cameras of cam00, cam01 .. cam19, not all"):
+        held_cameras(["x"], [f"cam{k:02d}" for k in range(20)], [])
+
+
+@pytest.mark.slow
+def test_films_of_two_rates_or_none_at_all_are_refused(films, tmp_path):
+    folder = shutil.copytree(films / "toy", tmp_path / "toy")
+    write_film(folder / "cam01.mp4", numbered(6, (32, 48)), stamps="N*40")
+    match = (
+        "cam01.mp4: expected frames at the times of cam00.mp4, 30 a second, but got 25 a second, 0.02 s apart"
+    )
+    with pytest.raises(SceneError, match=match):
+        read_scene(tmp_path, "toy")
+    (folder / "cam01.mp4").write_bytes(b"text")
+    with pytest.raises(SceneError, match="cam01.mp4: expected a video, but got another file; copy it again"):
+        read_scene(tmp_path, "toy")
+
+
+@pytest.mark.parametrize("change", [{"fy": 1.0}, {"cx": 3.0}])
+def test_cameras_that_the_layout_cannot_tell_are_not_written(tmp_path, change):
+    with pytest.raises(SceneError, match="camera 0: expected square pixels, the principal point"):
+        write_poses(tmp_path, [replace(CAMERAS[0], **change)], near=1, far=2)
+    odd = replace(CAMERAS[0], width=47, cx=23.5)
+    with pytest.raises(SceneError, match="cam00.mp4: expected even sides, but got 47 x 32"):
+        write_scene(tmp_path, [odd], [[]], near=1, far=2)
