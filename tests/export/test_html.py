@@ -78,6 +78,11 @@ def test_a_method_without_particles_is_refused_with_what_it_can_give(ball, tmp_p
 # In a browser ----------------------------------------------------------------------------------------------
 
 
+def in_browser(test):
+    """Mark a test that opens the page."""
+    return pytest.mark.browser(pytest.mark.slow(test))
+
+
 @pytest.fixture(scope="module")
 def browser():
     with chromium() as found:
@@ -86,12 +91,15 @@ def browser():
 
 @pytest.fixture
 def opened(browser, particles, tmp_path):
-    """``opened(address="", **options)``: the page of ``particles`` in a tab that complains of nothing."""
-    source = replace(particles, name=ATTACK)
-    export(source, tmp_path / "html")
+    """``opened(address="", source=None, **options)``: the page in a tab that complains of nothing.
+
+    Without a ``source`` it is that of ``particles``.
+    """
     tabs = []
 
-    def open_page(address="", **options):
+    def open_page(address="", source=None, **options):
+        if source is not None or not tabs:
+            export(source or replace(particles, name=ATTACK), tmp_path / "html")
         tab = Tab(browser, None, **{"width": 320, "height": 320} | options)
         tab.page.goto((tmp_path / "html" / "scene.html").as_uri() + address)
         tab.page.evaluate(SETTLED)
@@ -151,8 +159,7 @@ def fitted(camera, width, height):
     return replace(camera, width=width, height=height, cx=cx, cy=cy)
 
 
-@pytest.mark.browser
-@pytest.mark.slow
+@in_browser
 def test_it_draws_what_the_method_renders(particles, opened):
     tab, cameras = opened(), cameras_of(particles)
     assert state(tab, "renderer.bits", "scene.cameras.length") == [32, len(cameras)]
@@ -165,8 +172,7 @@ def test_it_draws_what_the_method_renders(particles, opened):
         assert float((wanted - wanted[0, 0]).abs().max()) > 0.2
 
 
-@pytest.mark.browser
-@pytest.mark.slow
+@in_browser
 def test_what_is_shown_follows_the_address(particles, opened):
     cameras = cameras_of(particles)
     for number, time in ((0, 0.0), (2, 0.5), (3, 1.0)):
@@ -183,19 +189,16 @@ def test_what_is_shown_follows_the_address(particles, opened):
     assert state(opened("?t=0.2&autoplay=1"), "playing") == [True]
 
 
-@pytest.mark.browser
-@pytest.mark.slow
-def test_layers_are_those_of_the_run(browser, tmp_path):
+@in_browser
+def test_layers_are_those_of_the_run(opened):
     data = small_data()
     module = module_with(data, **EVERY)
-    nodes, frames, name = module.method.nodes, data.scene.train, tmp_path / "html"
+    nodes, frames = module.method.nodes, data.scene.train
     right = nodes.positions[:, 0] > nodes.positions[:, 0].median()
     nodes.translations.data[right] += torch.linspace(-0.6, 0.6, nodes.curve.count)[:, None]
     times = [frame.time for frame in frames]
     source = Source(module, "particles", [f.camera for f in frames], TIMES, image_times=times)
-    export(source, name)
-    tab = Tab(browser, None, width=320, height=320)
-    tab.page.goto((name / "scene.html").as_uri())
+    tab = opened(source=source)
     counts = state(tab, "scene.count", "scene.moving", "scene.inMotion")
     assert counts[0] >= counts[1] > counts[2] > 0
     tab.page.keyboard.press("v")
@@ -208,12 +211,9 @@ def test_layers_are_those_of_the_run(browser, tmp_path):
         wanted = image.reshape(100, 100, 3).clamp(max=1)
         assert psnr(drawn(tab, source, layer=layer, **asked), wanted) > 50
         assert float((1 - wanted).max()) > 0.1
-    assert tab.errors == []
-    tab.page.close()
 
 
-@pytest.mark.browser
-@pytest.mark.slow
+@in_browser
 def test_it_is_played_turned_and_set_by_keys_and_mouse(opened):
     tab = opened("?t=0.5")
     page, first = tab.page, shown(tab)[60:240, 20:300]
@@ -255,8 +255,7 @@ def test_it_is_played_turned_and_set_by_keys_and_mouse(opened):
     assert not page.get_by_role("dialog").is_visible()
 
 
-@pytest.mark.browser
-@pytest.mark.slow
+@in_browser
 def test_nothing_plays_by_itself_where_motion_is_not_wanted(opened):
     assert state(opened(), "playing") == [True]
     tab = opened(reduced_motion="reduce")
@@ -266,8 +265,7 @@ def test_nothing_plays_by_itself_where_motion_is_not_wanted(opened):
     assert state(tab, "playing") == [False]
 
 
-@pytest.mark.browser
-@pytest.mark.slow
+@in_browser
 def test_names_are_not_executed(opened):
     tab = opened()
     assert tab.page.evaluate("typeof attacked") == "undefined"
@@ -276,8 +274,7 @@ def test_names_are_not_executed(opened):
     assert {worker.url.partition(":")[0] for worker in tab.page.workers} == {"data"}
 
 
-@pytest.mark.browser
-@pytest.mark.slow
+@in_browser
 @pytest.mark.parametrize(
     ("script", "says"),
     [
@@ -307,8 +304,7 @@ def test_a_browser_that_cannot_play_it_shows_a_picture_and_says_so(
     tab.page.close()
 
 
-@pytest.mark.browser
-@pytest.mark.slow
+@in_browser
 def test_it_comes_back_after_the_graphics_card_was_taken_away(opened):
     tab = opened("?t=0.5")
     first = shown(tab)
@@ -324,8 +320,7 @@ def test_it_comes_back_after_the_graphics_card_was_taken_away(opened):
     tab.errors[:] = [error for error in tab.errors if "CONTEXT_LOST" not in error]
 
 
-@pytest.mark.browser
-@pytest.mark.slow
+@in_browser
 def test_it_works_inside_another_page(browser, particles, tmp_path, opened):
     file = tmp_path / "outer.html"
     export(particles, tmp_path / "inner")
@@ -342,8 +337,7 @@ def test_it_works_inside_another_page(browser, particles, tmp_path, opened):
     tab.page.close()
 
 
-@pytest.mark.browser
-@pytest.mark.slow
+@in_browser
 def test_compressed_views_are_decoded_as_python_encodes_them(opened):
     tab = opened()
     decode = """([data, count, stride, filter]) => {
@@ -369,14 +363,11 @@ def test_compressed_views_are_decoded_as_python_encodes_them(opened):
     assert abs(got.astype(int) - wanted.astype(int)).max() <= 1
 
 
-@pytest.mark.browser
-@pytest.mark.slow
-def test_lenses_bend_what_it_draws(browser, particles, tmp_path):
+@in_browser
+def test_lenses_bend_what_it_draws(particles, opened):
     lens = Lens((0.5, -0.2, 0.1), (0.05, -0.06))
     cameras = [replace(camera, lens=lens, skew=2.0) for camera in particles.cameras]
-    export(replace(particles, cameras=cameras), tmp_path / "html")
-    tab = Tab(browser, None, width=320, height=320)
-    tab.page.goto((tmp_path / "html" / "scene.html").as_uri())
+    tab = opened(source=replace(particles, cameras=cameras))
     camera = cameras[0].resized(120, 120)
     got = drawn(tab, particles, width=120, height=120, time=0.3, camera=0)
     assert psnr(got, rendered(particles, camera, 0.3)) > 50
@@ -388,31 +379,23 @@ def test_lenses_bend_what_it_draws(browser, particles, tmp_path):
             view = {"bend": [*k, *p], "focal": [wide.fx, wide.fy], "skew": wide.skew, "size": [120, 120]}
             reach = tab.page.evaluate("reachOf", view | {"middle": [wide.cx, wide.cy]})
             assert reach == pytest.approx(pinhole_of(wide, 0.1).reach, rel=1e-4)
-    assert tab.errors == []
-    tab.page.close()
 
 
-@pytest.mark.browser
-@pytest.mark.slow
-def test_each_camera_leaves_out_what_is_too_near_to_it(browser, particles, tmp_path):
+@in_browser
+def test_each_camera_leaves_out_what_is_too_near_to_it(particles, opened):
     first, second, *others = particles.cameras
     away = float(second.center.norm())  # half of the scene is nearer
     cameras = [first, replace(second, near=10 * away, far=20 * away), *others]
-    export(replace(particles, cameras=cameras), tmp_path / "html")
-    tab = Tab(browser, None, width=320, height=320)
-    tab.page.goto((tmp_path / "html" / "scene.html").as_uri())
+    tab = opened(source=replace(particles, cameras=cameras))
     for number in (0, 1):
         camera = cameras_of(replace(particles, cameras=cameras))[number].resized(120, 120)
         got = drawn(tab, particles, width=120, height=120, time=0.3, camera=number)
         assert psnr(got, rendered(particles, camera, 0.3)) > 50
     whole = rendered(particles, second.resized(120, 120), 0.3)
     assert psnr(got, whole) < 30
-    assert tab.errors == []
-    tab.page.close()
 
 
-@pytest.mark.browser
-@pytest.mark.slow
+@in_browser
 def test_the_page_of_a_run_looks_as_the_run_renders_it(browser, ok, fitted, tmp_path):
     data = [f"data.root={fitted.parent}/scenes", "data=dnerf", "data.scene=vehicle", "budget.minutes=null"]
     words = ["budget.iterations=200", "model=particles", "preset=demo", "trainer=cpu", "evaluate=false"]
@@ -435,37 +418,28 @@ def test_the_page_of_a_run_looks_as_the_run_renders_it(browser, ok, fitted, tmp_
     tab.page.close()
 
 
-@pytest.mark.browser
-@pytest.mark.slow
+@in_browser
 @pytest.mark.parametrize(
     "effects",
     [BARE, {"motion": "cosines", "rotation": None, "view_dependence": 3}, {"opacity_over_time": 2}],
     ids=["at rest", "cosines", "opacity"],
 )
-def test_scenes_of_other_effects_are_drawn_too(browser, tmp_path, effects):
+def test_scenes_of_other_effects_are_drawn_too(opened, effects):
     data = small_data()
     module = module_with(data, **effects)
     for parameter in module.method.parameters():
         parameter.data += 0.1 * torch.randn(parameter.shape, generator=torch.Generator().manual_seed(1))
     source = Source(module, "particles", [frame.camera for frame in data.scene.train], TIMES)
-    export(source, tmp_path / "html")
-    tab = Tab(browser, None, width=320, height=320)
-    tab.page.goto((tmp_path / "html" / "scene.html").as_uri())
+    tab = opened(source=source)
     assert state(tab, "playing") == [module.method.moves]
     for time in (0.0, 0.37, 1.0):
         got = drawn(tab, source, width=120, height=120, time=time, camera=0)
         assert psnr(got, rendered(source, source.cameras[0].resized(120, 120), time)) > 50
-    assert tab.errors == []
-    tab.page.close()
 
 
-@pytest.mark.browser
-@pytest.mark.slow
-def test_trails_follow_what_moves_and_two_fingers_come_nearer(browser, particles, tmp_path):
-    export(particles, tmp_path / "html")
-    tab = Tab(browser, None, width=320, height=320, has_touch=True)
-    tab.page.goto((tmp_path / "html" / "scene.html").as_uri() + "?t=0.6&controls=0")
-    tab.page.evaluate(SETTLED)
+@in_browser
+def test_trails_follow_what_moves_and_two_fingers_come_nearer(particles, opened):
+    tab = opened("?t=0.6&controls=0", has_touch=True)
     plain = shown(tab)
     tab.page.keyboard.press("t")
     tab.page.evaluate(SETTLED)
@@ -491,12 +465,9 @@ def test_trails_follow_what_moves_and_two_fingers_come_nearer(browser, particles
     until(lambda: state(tab, "eye")[0] != before)
     assert state(tab, "away")[0] == pytest.approx(away / 2, rel=0.02)
     assert eye != before
-    assert tab.errors == []
-    tab.page.close()
 
 
-@pytest.mark.browser
-@pytest.mark.slow
+@in_browser
 def test_a_broken_scene_is_told_and_the_picture_stays(browser, particles, tmp_path):
     content, _ = packed_scene(particles, "html", quality="compact", seconds=2.0)
     length = int.from_bytes(content[12:16], "little")
@@ -526,8 +497,7 @@ def test_a_broken_scene_is_told_and_the_picture_stays(browser, particles, tmp_pa
         tab.page.close()
 
 
-@pytest.mark.browser
-@pytest.mark.slow
+@in_browser
 def test_the_view_rides_along_with_one_camera_until_somebody_turns_it(browser, particles, tmp_path):
     first, times = particles.cameras[0], torch.linspace(0, 1, 20, dtype=torch.float64)
     path = orbit(first, torch.zeros(3, dtype=torch.float64), torch.tensor([0.0, 0, 1]).double(), 0.2 * times)
