@@ -107,7 +107,7 @@ write_lego_complete = partial(write_dnerf, ability="time")
 DATASETS = {
     "dnerf": (write_dnerf, dnerf.read_scene),
     "hypernerf": (write_hypernerf, partial(hypernerf.read_scene, scale=1, box=BOX)),
-    "nhr": (write_nhr, partial(nhr.read_scene, half_resolution=False, test_views=[0])),
+    "nhr": (write_nhr, partial(nhr.read_scene, half_resolution=False, test_cameras=[0])),
     "lego_complete": (write_lego_complete, dnerf.read_lego_complete),
     "multicam": (write_multicam, partial(multicam.read_scene, scale=1, box=BOX, normalise=False)),
 }

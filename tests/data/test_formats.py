@@ -293,8 +293,12 @@ OPTIONS = {
         ({"scale": 8}, "8x: expected a folder of images.* set data.scale .*: 1x, 2x$"),
     ],
     "dome": [
-        ({"test_views": [4]}, r"data.test_views: expected different cameras of 0 to 3, not all, but .*\[4\]"),
-        ({"test_views": [1, 1]}, "data.test_views: expected"),
+        (
+            {"test_cameras": [4]},
+            r"test_cameras: expected different cameras of 0, 1, 2, 3, not all, but .*\[4\]",
+        ),
+        ({"test_cameras": [1, 1]}, "data.test_cameras: expected"),
+        ({"test_moments": [3]}, "data.test_moments: expected numbers of 0 to 2"),
         ({"frames": 0}, "data.frames: expected a whole number of at least 1, but got 0"),
         ({"test_every": 1.5}, "data.test_every: expected a whole number of at least 1, but got 1.5"),
         ({"half_resolution": "auto"}, "data.half_resolution: expected true or false, but got 'auto'"),

@@ -11,6 +11,7 @@ import torch
 from forewarp.data.cameras import FLIP
 from forewarp.data.files import SceneError
 from forewarp.data.images import write_image
+from forewarp.data.module import NHRDataModule
 from forewarp.data.nhr import read_scene
 from tests.support.written_scenes import BALLS, COLORS, STEP, dome, dome_frames, dome_truth, place, write_dome
 
@@ -97,7 +98,7 @@ def test_near_and_far_hold_the_box(written):
 def test_odd_sizes_are_halved_exactly(tmp_path):
     cameras = dome(3, sizes=((61, 49), (48, 60)))
     write_dome(tmp_path / "odd", cameras, 1)
-    scene = read_scene(tmp_path, "odd", test_views=[1])
+    scene = read_scene(tmp_path, "odd", test_cameras=[1])
     camera = scene.train[0].camera
     assert (camera.width, camera.height) == (30, 24)
     assert (camera.fx, camera.cx, camera.skew) == (35.0, cameras[0].cx / 2, 0.35)
@@ -108,11 +109,15 @@ def test_odd_sizes_are_halved_exactly(tmp_path):
 def test_held_out_views(tmp_path, written):
     write_dome(tmp_path / "many", dome(56, sizes=((2, 2),)), 1)
     assert read_scene(tmp_path, "many").protocol["test_views"] == [0, 9, 18, 28, 37, 46]
-    scene = read_scene(tmp_path, "many", test_views=[7, 3])
+    scene = read_scene(tmp_path, "many", test_cameras=[7, 3])
     assert [frame.name for frame in scene.test] == ["0/img_0003", "0/img_0007"]
     assert len(scene.train) == 54
     scene = read_scene(written, "toy", test_every=2, frames=200)
     assert [frame.name for frame in scene.test] == ["0/img_0000", "2/img_0000"]
+    scene = read_scene(written, "toy", test_cameras=[], test_moments=[1])
+    assert [(f.name, f.ability) for f in scene.test] == [(f"1/img_{k:04d}", "time") for k in range(4)]
+    before = NHRDataModule(written, "toy", test_views=[2]).scene  # as of runs before the key's name changed
+    assert before.protocol["test_views"] == [2]
 
 
 @pytest.mark.parametrize(("frames", "there"), [(1, 3), (3, 5), (2, 3), (9, 5)])

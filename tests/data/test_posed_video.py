@@ -466,3 +466,51 @@ def test_smaller_images_beside_the_others(tmp_path):
     assert (camera.fx, camera.cy) == pytest.approx((full.fx * 7 / 30, full.cy / 4))
     assert (camera.lens, scene.train[0].name) == (LENS, "images/frame_1")
     assert scene.train[0].load().shape == (5, 7, 4)
+
+
+def rig(folder, count=4):
+    """Two cameras, left and right, at each of some times."""
+    cameras = posed_cameras(2)
+    images = [(f"{side}_{t}.png", k, t) for t in range(count) for k, side in enumerate(("left", "right"))]
+    rng = np.random.default_rng(0)
+    shots = [
+        PosedShot(
+            name, cameras[k], rng.integers(0, 256, (20, 30, 3), np.uint8), t / (count - 1), taken_by=name[:-6]
+        )
+        for name, k, t in images
+    ]
+    write_scene(folder, shots, near=20.0, far=120.0)
+    return folder
+
+
+def test_cameras_of_a_rig_are_told_apart_and_held_out_by_name(tmp_path):
+    rig(tmp_path / "toy")
+    scene = read_scene(tmp_path, "toy")
+    assert {(f.name[7:-2], f.camera_id) for f in scene.train} == {("left", 0), ("right", 1)}
+    assert (scene.protocol["views"], {f.ability for f in scene.test}) == (2, {"all"})
+    scene = read_scene(tmp_path, "toy", test_cameras=["right"], test_moments=[2])
+    assert [f.name for f in scene.train] == [f"images/left_{t}" for t in (0, 1, 3)]
+    assert {f.name: f.ability for f in scene.test} == {
+        **{f"images/right_{t}": "space" for t in (0, 1, 3)},
+        "images/left_2": "time",
+        "images/right_2": "space_time",
+    }
+    assert scene.protocol["test_cameras"] == ["right"]
+    assert scene.protocol["test_moments"] == [2]
+    data = PosedVideoDataModule(tmp_path, "toy", test_moments=[2], views_per_step=2, rays=8)
+    assert {o.moment.camera for o in data.batches.draw().observations} == {0, 1}
+
+
+def test_cameras_without_names_are_not_held_out_by_name(tmp_path, made):
+    made()
+    for options in ({"test_cameras": ["left"]}, {"test_moments": [1]}):
+        with pytest.raises(
+            SceneError, match="data.test_cameras: expected a camera in the frames of .* got none"
+        ):
+            read_scene(tmp_path, "toy", **options)
+    rig(tmp_path / "rig")
+    edit(tmp_path / "rig" / FILE, {"frames.1.camera": GONE})
+    with pytest.raises(
+        SceneError, match=r"frames: camera: expected one in all frames or in none, but got 7 of 8"
+    ):
+        read_scene(tmp_path, "rig")

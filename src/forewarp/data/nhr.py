@@ -22,6 +22,7 @@ from forewarp.data.cameras import box_of, check_middle, pose_of
 from forewarp.data.directions import inverted, opposite, other_readings
 from forewarp.data.files import SceneError, mismatch, numbers_of, opened, remove, scene_folder, whole
 from forewarp.data.images import StoredImage, by, check_pixels, inspect_image, turned_by_exif, write_image
+from forewarp.data.rigs import held_cameras, held_moments, split_rig
 from forewarp.files import decoded, replace_file
 from forewarp.scene.box import Box
 from forewarp.scene.camera import Camera
@@ -55,7 +56,8 @@ def read_scene(
     half_resolution: bool = True,
     box: Sequence[float] | None = None,
     frames: int = 100,
-    test_views: Sequence[int] | None = None,
+    test_cameras: Sequence[int | str] | None = None,
+    test_moments: Sequence[int] | None = None,
     test_every: int = 1,
 ) -> Scene:
     """Read ``root/scene``; of the images only headers are read, pixels are decoded when a frame is loaded.
@@ -65,8 +67,9 @@ def read_scene(
         box: x0 y0 z0 x1 y1 z1 in world units; None takes the bounds of all point clouds, 10 % wider per side.
         frames: how many, from the first; where there are fewer, all. The last of them is at the time 1, those
             between by their numbers.
-        test_views: numbers of the cameras held out; None spreads 6 of every 56 over them.
-        test_every: measure every n-th frame only.
+        test_cameras: numbers of the cameras held out; None spreads 6 of every 56 over them.
+        test_moments: numbers of the frames, from 0, that no camera is trained on; None: none.
+        test_every: measure held-out cameras in every n-th frame only.
 
     Raises:
         SceneError: for every file or value that is missing or wrong, with file and line.
@@ -80,7 +83,11 @@ def read_scene(
     if len(poses) != len(matrices):
         got = f"{len(matrices)} there and {len(poses)} in CamPose.inf"
         raise mismatch(folder / "Intrinsic.inf", "as many cameras as poses", got)
-    held = _held_out(test_views, len(poses), folder)
+    if len(poses) < 2:
+        raise mismatch(folder / "CamPose.inf", "at least 2 cameras, one to measure", "1")
+    tests = max(1, round(len(poses) * 6 / 56))
+    spread_out = [i * len(poses) // tests for i in range(tests)]
+    held = held_cameras(test_cameras, [str(k) for k in range(len(poses))], spread_out)
     every, moments = whole(test_every, "data.test_every", 1), whole(frames, "data.frames", 1)
     there = (path for path in folder.glob("img/*") if path.is_dir() and path.name.isdecimal())
     places = sorted(there, key=lambda path: (int(path.name), path.name))
@@ -90,6 +97,7 @@ def read_scene(
         expected, got = "a folder of images for each frame, named by its number", "".join(twice[:1]) or "none"
         raise mismatch(folder / "img", expected, got, "remove one" if twice else "")
     numbers, moments = on_disk[:moments], min(moments, len(places))
+    held_times = held_moments(test_moments, moments)
     counted = (path.stem[4:] for place in places for path in place.glob("img_*.jpg"))
     first = min((int(number) for number in counted if number.isdecimal()), default=0)
     names = [f"img_{k:04d}.jpg" for k in range(first, first + len(poses))]
@@ -102,12 +110,12 @@ def read_scene(
     def view(f: int, k: int) -> Frame:
         place, name = places[f], names[k]
         load = StoredImage(place / name, sizes[k], half_resolution, place / "mask" / name)
-        time, ability = (numbers[f] - numbers[0]) / span, "space" if k in held else "all"
-        return Frame(f"{place.name}/{Path(name).stem}", time, cameras[k], load, ability=ability, camera_id=k)
+        time = (numbers[f] - numbers[0]) / span
+        return Frame(f"{place.name}/{Path(name).stem}", time, cameras[k], load, camera_id=k)
 
     span = max(numbers[-1] - numbers[0], 1)
-    train = tuple(view(f, k) for f in range(moments) for k in range(len(poses)) if k not in held)
-    test = tuple(view(f, k) for f in range(0, moments, every) for k in held)
+    taken = ((f, view(f, k)) for f in range(moments) for k in range(len(poses)))
+    train, test = split_rig(taken, held, held_times, every)
     protocol = {
         "dataset": "nhr",
         "resolution": [list(size) for size in sorted({(c.width, c.height) for c in cameras}, reverse=True)],
@@ -118,6 +126,8 @@ def read_scene(
         "test_frames": len(test),
         "mask_box": True,
     }
+    if held_times:
+        protocol["test_moments"] = sorted(held_times)
     if on_disk[0] != 0 or first != 0 or on_disk[-1] - on_disk[0] >= len(on_disk):
         said = f"frames {on_disk[0]} to {on_disk[-1]} ({len(on_disk)}) and cameras from {first}"
         assumed = [f"{folder / 'img'}: {said} taken in order, times by their numbers", *assumed]
@@ -223,19 +233,6 @@ def _lines(path: Path) -> list[tuple[int, list[str]]]:
     if not lines:
         raise mismatch(path, "at least one camera", "an empty file")
     return lines
-
-
-def _held_out(views: Sequence[int] | None, count: int, folder: Path) -> list[int]:
-    """Choose the cameras that are measured, ascending."""
-    if count < 2:
-        raise mismatch(folder / "CamPose.inf", "at least 2 cameras, one to measure", "1")
-    if views is None:
-        tests = max(1, round(count * 6 / 56))
-        return [i * count // tests for i in range(tests)]
-    are_cameras = isinstance(views, Sequence) and all(type(k) is int and 0 <= k < count for k in views)
-    if not are_cameras or not 0 < len(set(views)) < count or len(set(views)) < len(views):
-        raise mismatch("data.test_views", f"different cameras of 0 to {count - 1}, not all", repr(views))
-    return sorted(views)
 
 
 def _read_sizes(

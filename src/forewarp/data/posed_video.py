@@ -6,7 +6,8 @@ lengths (``near``, ``far``, ``aabb``; ``data.near``, ``data.far``, ``data.box``)
 which may be any: the scene is normalised. The optional ``points.npy`` (N, 3), or the PLY that the file names,
 holds points that never move.
 
-Beyond nerfstudio's keys a frame may have ``moving_path``, a grey PNG as large as the unscaled image, bright
+Beyond nerfstudio's keys a frame may have ``camera``, a name or a number of which of several cameras took it;
+and ``moving_path``, a grey PNG as large as the unscaled image, bright
 where something moves, which is scored apart. ``moving_from`` says where these come from, ``seconds`` how long
 the film is.
 """
@@ -44,10 +45,12 @@ from forewarp.data.images import (
     by,
     check_pixels,
     hides_image,
+    in_order,
     inspect_image,
     turned_by_exif,
     write_image,
 )
+from forewarp.data.rigs import held_cameras, held_moments, split_rig
 from forewarp.data.transforms import (
     camera_of,
     check_axes,
@@ -78,7 +81,7 @@ class PosedShot:
     """An image to write: ``name`` its file, .png or .jpg; ``pixels`` uint8 (H, W, 3), or (H, W, 4) of
     straight alpha; ``camera`` of that size, its near and far are not written; ``time`` in [0, 1] or None;
     ``split`` train, val or test, or "" where the reader is to choose; ``moving`` bool (H, W), what moves, or
-    None where it is not known.
+    None where it is not known; ``taken_by`` the name of the camera, of a rig.
     """
 
     name: str
@@ -87,6 +90,7 @@ class PosedShot:
     time: float | None = None
     split: str = ""
     moving: np.ndarray | None = None
+    taken_by: str | None = None
 
 
 def read_scene(
@@ -100,6 +104,8 @@ def read_scene(
     normalise: bool = True,
     canonical: str = "middle",
     test_every: int = 8,
+    test_cameras: Sequence[str | int] | None = None,
+    test_moments: Sequence[int] | None = None,
     axes: str | None = None,
     inverse: bool = False,
     masks: str | None = None,
@@ -121,6 +127,8 @@ def read_scene(
         canonical: the training time nearest to the ``middle``, or the ``first``.
         test_every: every n-th frame is a test frame, the first and the last never, where the file does not
             list ``<split>_filenames``.
+        test_cameras: names of the cameras held out, of frames that have ``camera``; None: see above.
+        test_moments: numbers of the times, from 0, that no camera is trained on; None: see above.
         axes: of the poses in the file: opengl or opencv; None: OpenGL's, unless the cameras look away from
             what they surround, which is refused.
         inverse: poses in the file are world-to-camera.
@@ -157,7 +165,14 @@ def read_scene(
     given = {entry.name: entry.time for entry in entries}
     entries = [replace(entry, time=time) for entry, time in zip(entries, times)]
     entries.sort(key=lambda entry: entry.time)
-    parts, how = _split_entries(file, content, entries, test_every, absent)
+    views = in_order({entry.taken_by for entry in entries} - {None})
+    by_name = test_cameras is not None or test_moments is not None
+    if by_name and not views:
+        advice = "write a name or a number in each frame"
+        raise mismatch("data.test_cameras", f"a camera in the frames of {file}", "none", advice)
+    parts, how = {"train": entries, "val": [], "test": []}, "cameras and moments held out by name"
+    if not by_name:
+        parts, how = _split_entries(file, content, entries, test_every, absent)
     check_times({split: {e.name: given[e.name] for e in part} for split, part in parts.items()}, str(file))
     near, far = (_length(file, content, key, value) for key, value in (("near", near), ("far", far)))
     bounds = _bounds(file, content, box)
@@ -175,13 +190,16 @@ def read_scene(
     options = {"near": near, "far": far, "box": bounds, "normalise": normalise, "cut_out": has_alpha}
     space, seen = space_of([entry.camera for entry in entries], str(file), **options)
 
-    train, val, test = (
-        tuple(
-            Frame(e.name, e.time, space.camera(e.camera), e.load, load_valid=e.valid, load_moving=e.moving)
-            for e in parts[split]
-        )
-        for split in SPLITS
-    )
+    def frame(e: ImageEntry) -> Frame:
+        number = None if e.taken_by is None else views.index(e.taken_by)
+        optional = {"load_valid": e.valid, "load_moving": e.moving, "camera_id": number}
+        return Frame(e.name, e.time, space.camera(e.camera), e.load, **optional)
+
+    train, val, test = (tuple(map(frame, parts[split])) for split in SPLITS)
+    moments = {time: n for n, time in enumerate(sorted({*times}))}
+    held = held_cameras(test_cameras, views, []), held_moments(test_moments, len(moments))
+    if by_name:
+        train, test = split_rig(((moments[f.time], f) for f in train), *held)
     if not isinstance(moving_from := content.get("moving_from", "moving_path of the frames"), str):
         raise mismatch(f"{file}: moving_from", "text", short(moving_from))
     start = (min if canonical == "first" else middle_of)([frame.time for frame in train])
@@ -196,6 +214,10 @@ def read_scene(
         "far": space.far,
         "derived": [name for name in ("near", "far", "box") if options[name] is None],
     }
+    if views:
+        protocol["views"] = len(views)
+    if by_name:
+        protocol |= {"test_cameras": [views[k] for k in held[0]], "test_moments": sorted(held[1])}
     if train[0].load_valid is not None:
         protocol["masks"] = (
             "ignore: PSNR is of the pixels that count, other metrics see the true colour elsewhere"
@@ -239,6 +261,7 @@ class ImageEntry:
     has_alpha: bool
     valid: StoredMask | None = None
     moving: MovingMask | None = None
+    taken_by: str | None = None
 
 
 def _read_entries(
@@ -291,10 +314,13 @@ def _read_entries(
         load = StoredImage(image, header.size, mask=None if valid else mask, opaque=opaque)
         has_mask.append(mask is not None)
         is_cut_out = header.has_alpha and not opaque
-        entries.append(ImageEntry(name, time_in(entry), camera, load, is_cut_out, valid, moving))
+        taken_by = entry.own.get("camera")
+        taken_by = str(taken_by) if type(taken_by) in (str, int) else None  # an object is another program's
+        entries.append(ImageEntry(name, time_in(entry), camera, load, is_cut_out, valid, moving, taken_by))
     for key, given in (
         ("mask_path", has_mask),
         ("moving_path", [e.moving is not None for e in entries]),
+        ("camera", [e.taken_by is not None for e in entries]),
         ("file_path: alpha", [e.has_alpha or e.load.mask is not None for e in entries]),
     ):
         if any(given) and not all(given):
@@ -463,6 +489,8 @@ def _write_shot(folder: Path, shot: PosedShot, taken: set[str]) -> dict:
     if shot.time is not None:
         entry["time"] = number(shot.time, f"{shot.name}: time", 0, 1)
     entry["transform_matrix"] = opengl_rows(camera.camera_to_world, shot.name)
+    if shot.taken_by is not None:
+        entry["camera"] = shot.taken_by
     write_image(folder / entry["file_path"], pixels)
     if shot.moving is not None:
         mask = np.uint8(255) * np.asarray(shot.moving, bool)
