@@ -13,6 +13,7 @@ from torch import Tensor
 
 from forewarp.fields.curves import Curve
 from forewarp.ops.gaussians import (
+    CHUNK,
     COLUMN,
     FLAT,
     Gaussians,
@@ -112,6 +113,7 @@ class GaussiansSnapshot:
         warp: how they move until then.
         color_basis, opacity_basis: what the time makes of colours (T,) and of opacity (F,).
         blur: square pixels added to the variance of every splat.
+        chunk: see ``rasterize``.
     """
 
     moment: Moment
@@ -120,6 +122,7 @@ class GaussiansSnapshot:
     color_basis: Tensor
     opacity_basis: Tensor
     blur: float
+    chunk: int = CHUNK
 
     __repr__ = brief
 
@@ -129,7 +132,7 @@ class GaussiansSnapshot:
         """
         pinhole = pinhole_of(view.camera, self.blur)
         splats = project(self.gaussians, self.warp, pinhole, self.color_basis, self.opacity_basis)
-        color, distance, through = rasterize(splats, *pinhole.size)
+        color, distance, through = rasterize(splats, *pinhole.size, self.chunk)
         color, distance, through = color.reshape(3, -1).T, distance.reshape(-1), through.reshape(-1)
         if view.indices is not None:
             rows = view.indices.to(color.device)
@@ -158,7 +161,7 @@ class GaussiansSnapshot:
             splats = project(self.gaussians, self.warp, pinhole, self.color_basis, self.opacity_basis)
         values = splats.values.clone().requires_grad_()
         with torch.enable_grad():
-            color = rasterize(splats._replace(values=values), *pinhole.size).color
+            color = rasterize(splats._replace(values=values), *pinhole.size, self.chunk).color
             return torch.autograd.grad(color[0].sum(), values)[0][:, COLUMN.red]
 
     def holds(self, moment: Moment) -> bool:

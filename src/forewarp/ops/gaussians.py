@@ -14,16 +14,20 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 from torch.nn.functional import pad
+from torch.utils.checkpoint import checkpoint
 
 from forewarp.ops.backend import arrays, check_shape, match_threads, use_numba
 from forewarp.ops.lens import distort_with_jacobian
 
 BLUR = 0.1  # square pixels; a pixel alone has a variance of 1/12
-FEASIBLE = 1 << 27  # splats times pixels of the reference: with gradients ten float32 tensors of these, 5 GB
+CHUNK = (
+    1 << 22
+)  # pairs of a splat and a pixel that the reference holds: with gradients some 12 tensors of them
 FLAT = 0.28209479177387814  # the first harmonic, 1 / sqrt(4 pi), which no direction changes
 LEAST_LOG = -math.log(255.0)  # of an alpha: less than a 255th is not seen
 MOST = 1 << 15  # splats of a tile that count, the nearest ones
 SIDE = 8  # pixels of a tile along both axes
+WIDE = 16  # the same of the reference
 SPLAT = 16  # numbers of a splat as kernels read it: its columns, then zeros
 _LEAST = 1e-12  # length of a quaternion below which it rotates nothing
 # Where the numbers of a splat lie; ``Splats.values`` has those up to the depth.
@@ -328,7 +332,7 @@ class Image(NamedTuple):
     transmittance: Tensor
 
 
-def rasterize(splats: Splats, width: int, height: int) -> Image:
+def rasterize(splats: Splats, width: int, height: int, chunk: int = CHUNK) -> Image:
     """Composite splats in the order of their depth.
 
     At a pixel whose centre is (dx, dy) from a splat, ``alpha = opacity exp(-(A dx^2 + 2 B dx dy + C dy^2) /
@@ -338,6 +342,7 @@ def rasterize(splats: Splats, width: int, height: int) -> Image:
     Args:
         splats: of N particles.
         width, height: of the image, pixels; any numbers >= 1.
+        chunk: pairs of a splat and a pixel that are in memory at once where there is no kernel.
 
     Returns:
         ``Image``, differentiable in the splats' values. A tile of 8 x 8 pixels ends where nothing of it
@@ -347,7 +352,7 @@ def rasterize(splats: Splats, width: int, height: int) -> Image:
         ValueError: for other shapes or sizes.
 
     Cost: of the kernel, about 60 ns a splat and tile that it touches and 10 ns a splat; of the reference,
-    N H W numbers of memory.
+    some 50 bytes of memory for each pair of a chunk.
     """
     check_shape("splats.values", splats.values, ("N", COLUMN.depth + 1))
     check_shape("splats.reach", splats.reach, (len(splats.values), 2))
@@ -356,39 +361,83 @@ def rasterize(splats: Splats, width: int, height: int) -> Image:
     if use_numba(splats.values) and splats.values.dtype == torch.float32:
         planes = _Rasterize.apply(*splats, width, height)[:, :height, :width]
     else:
-        planes = rasterize_reference(splats, width, height)
+        planes = rasterize_reference(splats, width, height, chunk)
     return Image(planes[:3], planes[3], planes[4])
 
 
-def rasterize_reference(splats: Splats, width: int, height: int) -> Tensor:
-    """``rasterize`` in plain PyTorch: planes (5, H, W) of colour, depth, and what is let through."""
-    seen = (splats.reach[:, 0] > 0).nonzero()[:, 0]
-    most = FEASIBLE / max(len(seen), 1)
-    if width * height > most:
-        wide, high = smaller(width, height, (most / (width * height)) ** 0.5)
-        raise ValueError(
-            f"rasterize: expected at most {FEASIBLE:,} splats times pixels without the kernels, but got "
-            f"{len(seen):,} x {width} x {height}; install forewarp[cpu] and compute on the CPU, in float32, "
-            f"or draw at most {wide} x {high} pixels"
-        )
-    values = splats.values[seen[splats.depth.detach()[seen].sort(stable=True).indices]]
-    x, y, a, b, c, solid = values[:, : COLUMN.red, None, None].unbind(1)
-    dx = torch.arange(width).to(values) + 0.5 - x  # (V, 1, W)
-    dy = (torch.arange(height).to(values) + 0.5)[:, None] - y  # (V, H, 1)
-    power = -0.5 * (a * dx * dx + c * dy * dy) - b * dx * dy + solid.log()
-    alpha = torch.where(power > LEAST_LOG, power.exp(), 0.0)
-    passed = torch.cumprod(torch.cat([alpha.new_ones(1, height, width), 1 - alpha]), 0)
-    shown = torch.einsum("vhw,vk->khw", alpha * passed[:-1], values[:, COLUMN.red :])
-    return torch.cat([shown, passed[-1:]])
+def rasterize_reference(splats: Splats, width: int, height: int, chunk: int = CHUNK) -> Tensor:
+    """``rasterize`` in plain PyTorch: planes (5, H, W) of colour, depth, and what is let through.
 
-
-def smaller(width: int, height: int, share: float) -> tuple[int, int]:
-    """Return the sides of an image of the same form, times a share of them.
-
-    >>> smaller(400, 300, 0.3337)
-    (133, 100)
+    Splats are sorted by depth and into tiles. As many tiles at a time are blended as have ``chunk`` pairs of
+    a splat and a pixel, at least one; the backward pass computes them anew.
     """
-    return max(1, int(share * width)), max(1, int(share * height))
+    values = splats.values
+    across, down = -(-width // WIDE), -(-height // WIDE)
+    rows, ends = _rows_of_tiles(splats, across, down)
+    lengths = torch.diff(ends, prepend=ends.new_zeros(1))
+    longest_first = lengths.argsort(descending=True)
+    begins, lengths = (ends - lengths)[longest_first], lengths[longest_first]
+    tiles = torch.stack([longest_first % across, longest_first // across, begins, lengths], 1)
+    planes, keep = [], values.requires_grad and torch.is_grad_enabled()
+    for piece in tiles.split(_pieces(lengths.tolist(), chunk)):
+        given = values, rows, piece
+        planes.append(checkpoint(_blend, *given, use_reentrant=False) if keep else _blend(*given))
+    planes = torch.cat(planes) + values[:0].sum()  # differentiable even where nothing is seen
+    image = planes[longest_first.argsort()].reshape(down, across, 5, WIDE, WIDE)
+    return image.permute(2, 0, 3, 1, 4).reshape(5, down * WIDE, across * WIDE)[:, :height, :width]
+
+
+def _rows_of_tiles(splats: Splats, across: int, down: int) -> tuple[Tensor, Tensor]:
+    """Return the rows of the splats that each tile touches, from near to far, and where each tile's end."""
+    seen = (splats.reach[:, 0] > 0).nonzero()[:, 0]
+    order = seen[splats.depth.detach()[seen].sort(stable=True).indices]
+    middle, reach = splats.values.detach()[order, :2], splats.reach[order]
+    most = middle.new_tensor([across, down]) - 1
+    low = ((middle - reach) / WIDE).floor().nan_to_num().clamp(min=0)
+    high = torch.minimum(((middle + reach) / WIDE).floor().nan_to_num(), most)
+    wide, tall = (high - low + 1).clamp(min=0).long().unbind(-1)
+    count = wide * tall
+    splat = torch.arange(len(order), device=order.device).repeat_interleave(count)
+    number = torch.arange(len(splat), device=order.device) - (count.cumsum(0) - count)[splat]
+    low = low.long()[splat]
+    tile = (low[:, 1] + number // wide[splat]) * across + low[:, 0] + number % wide[splat]
+    ends = torch.bincount(tile, minlength=across * down).cumsum(0)
+    return order[splat[tile.argsort(stable=True)]], ends
+
+
+def _pieces(lengths: Sequence[int], chunk: int) -> list[int]:
+    """Return how many tiles at a time, of falling ``lengths``, have at most ``chunk`` pairs when padded.
+
+    >>> _pieces([9, 4, 3, 0, 0], 10 * WIDE**2)
+    [1, 2, 2]
+    """
+    counts: list[int] = []
+    while (done := sum(counts)) < len(lengths):
+        most = chunk // (max(lengths[done], 1) * WIDE**2)
+        counts.append(min(max(1, most), len(lengths) - done))
+    return counts
+
+
+def _blend(values: Tensor, rows: Tensor, tiles: Tensor) -> Tensor:
+    """Composite the splats of tiles (G, 4), each its column and row, where its ``rows`` begin and how many.
+
+    Returns:
+        (G, 5, side, side): colour, depth, and what is let through.
+    """
+    begin, length = tiles[:, 2:, None].unbind(1)
+    place = torch.arange(int(length[0]), device=values.device)
+    entries = (begin + place).clamp(max=max(len(rows) - 1, 0))
+    own = values[rows[entries]]
+    x, y, a, b, c, solid = own[..., : COLUMN.red, None, None].unbind(2)
+    side = torch.arange(WIDE, device=values.device)[:, None] + 0.5
+    centers = WIDE * tiles[:, None, :2] + side  # (G, side, 2)
+    dx, dy = centers[:, None, None, :, 0] - x, centers[:, None, :, None, 1] - y
+    power = -0.5 * (a * dx * dx + c * dy * dy) - b * dx * dy + solid.log()
+    inside = (place < length)[..., None, None]
+    alpha = torch.where(inside & (power > LEAST_LOG), power.exp(), 0.0)
+    passed = torch.cumprod(torch.cat([alpha.new_ones(len(tiles), 1, WIDE, WIDE), 1 - alpha], 1), 1)
+    shown = torch.einsum("glhw,glk->gkhw", alpha * passed[:, :-1], own[..., COLUMN.red :])
+    return torch.cat([shown, passed[:, -1:]], 1)
 
 
 class _Tiles(NamedTuple):
@@ -505,6 +554,7 @@ def compare(
     by_skin: bool = False,
     kinds: Sequence[int] | None = None,
     loss: Callable[[Tensor, Tensor], Tensor] | None = None,
+    chunk: int = CHUNK,
 ) -> ImageLoss:
     """The loss ``sum sqrt(e^2 + width^2) - width`` over pixels and channels, and its gradients.
 
@@ -522,6 +572,7 @@ def compare(
             None: all (N, B, 3) are in one.
         loss: called with the image and the truth (H, W, 3), returns a differentiable (); autograd leads from
             it to the kernels. None: the loss above, which a kernel computes together with its gradients.
+        chunk: as of ``rasterize``.
 
     Returns:
         ``ImageLoss``; nothing in it has a graph.
@@ -545,10 +596,12 @@ def compare(
     given = pixels, background, width, factor, by_skin, kinds
     if loss is None and use_numba(particles.means) and particles.means.dtype == torch.float32:
         return _compare_numba(*seen, *given)
-    return compare_reference(seen, *given, loss)
+    return compare_reference(seen, *given, loss, chunk)
 
 
-def compare_reference(seen: tuple, pixels, background, width, factor, by_skin, kinds, loss=None) -> ImageLoss:
+def compare_reference(
+    seen: tuple, pixels, background, width, factor, by_skin, kinds, loss=None, chunk=CHUNK
+) -> ImageLoss:
     """``compare`` in plain PyTorch, on any device and in any precision; a ``loss`` by ``project`` and
     ``rasterize``, which use kernels. ``seen`` are the arguments of ``project``.
     """
@@ -559,9 +612,9 @@ def compare_reference(seen: tuple, pixels, background, width, factor, by_skin, k
         splats = (project if loss else project_reference)(own, own_warp, pinhole, *bases)
         splats.values.retain_grad()
         if loss:
-            color, _, transmittance = rasterize(splats, *pinhole.size)
+            color, _, transmittance = rasterize(splats, *pinhole.size, chunk)
         else:
-            planes = rasterize_reference(splats, *pinhole.size)
+            planes = rasterize_reference(splats, *pinhole.size, chunk)
             color, transmittance = planes[:3], planes[4]
         behind = background.to(color)
         drawn = color + transmittance * behind[:, None, None]

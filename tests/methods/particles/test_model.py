@@ -1,8 +1,6 @@
 """A step of particles, their effects and rates, on every device and without kernels."""
 
-import re
 from dataclasses import replace
-from types import SimpleNamespace
 
 import pytest
 import torch
@@ -12,7 +10,6 @@ from forewarp.methods.effect import switched
 from forewarp.methods.method import Start
 from forewarp.methods.particles import model
 from forewarp.methods.particles.model import Particles
-from forewarp.ops import backend
 from forewarp.scene.view import Moment, View
 from forewarp.training.objective import set_gradients
 from tests.contract.fitting import Losses, run_of, stage_of
@@ -200,64 +197,6 @@ def test_a_stage_and_its_queries_stay_on_their_device():
         assert method.bounds([0.0, 0.5]) is not None
         after = Particles(Start(DATA.scene, "fine", {}, range(3), before=method), **options)
         assert {t.device.type for t in after.state_dict().values()} == {"cpu"}
-
-
-def sized(width, height):
-    """A scene of 100 images of another size, of which a fifth shows something."""
-    camera = replace(DATA.scene.train[0].camera, width=width, height=height)
-
-    def load():
-        image = torch.zeros(height, width, 4, dtype=torch.uint8)
-        image[: height // 5] = 255
-        return image
-
-    frame = replace(DATA.scene.train[0], camera=camera, load=load)
-    return replace(DATA.scene, train=(frame,) * 100, val=(), test=(), held=())
-
-
-def refusal(scene, device=GPU, **numbers):
-    """What the refusal of a scene says, and the size that it names; None if it is feasible."""
-    try:
-        Particles.check_feasible(scene, "fine", numbers, device)
-    except ValueError as error:
-        width, height = map(int, re.search(r"at most (\d+) x (\d+) pixels", str(error)).groups())
-        return str(error), width, height
-    return None
-
-
-def test_without_kernels_large_images_are_refused_and_the_size_that_is_named_is_not():
-    message, width, height = refusal(sized(400, 400))
-    assert message.startswith("trainer: expected pictures of at most 1")
-    assert "have no kernels on a GPU, but got 400 x 400 and 16,1" in message
-    assert message.endswith("use trainer=cpu, or use smaller pictures")
-    assert 100 < width == height < 200
-    assert refusal(sized(width, height)) is None
-    assert refusal(sized(round(1.1 * width), round(1.1 * height)))
-    _, width, height = refusal(sized(800, 200))
-    assert width == pytest.approx(4 * height, abs=4)
-    large = replace(sized(400, 400).train[0], load=None)
-    assert refusal(replace(sized(60, 60), test=(large,)))  # those of the test count, too
-
-
-@pytest.mark.parametrize(
-    ("numbers", "feasible"),
-    [({}, False), ({"density": 20.0}, True), ({"initial_share": 0.2, "final_share": 0.2}, True)],
-)
-def test_fewer_particles_allow_larger_images(monkeypatch, numbers, feasible):
-    assert (refusal(sized(200, 200), **numbers) is None) == feasible
-    monkeypatch.setattr(backend, "numba_installed", lambda: True)
-    monkeypatch.setattr(model, "covered_pixels", None)  # with kernels nothing is looked at
-    assert refusal(sized(4000, 4000), torch.device("cpu"), **numbers) is None
-
-
-def test_without_numba_a_run_is_refused_before_anything_is_computed(tmp_path, monkeypatch):
-    monkeypatch.setattr(model, "first_points", lambda *_: pytest.fail("this takes seconds"))
-    large = SimpleNamespace(scene=sized(400, 400), setup=lambda _: None, restart=lambda _: None)
-    with (
-        implementation("reference"),
-        pytest.raises(ValueError, match=r"model: expected .* install forewarp\[cpu\]"),
-    ):
-        run_of([stage_of(METHODS["particles"])], large, tmp_path).fit()
 
 
 @pytest.mark.slow

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from functools import partial
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -25,23 +25,18 @@ from forewarp.methods.particles.start import (
     widths,
 )
 from forewarp.methods.rows import RowsAdam
-from forewarp.ops.backend import has_kernels
 from forewarp.ops.gaussians import (
     BLUR,
-    FEASIBLE,
+    CHUNK,
     Gaussians,
     Warp,
     compare,
-    smaller,
 )
 from forewarp.ops.nodes import pull_nodes
 from forewarp.scene.cloud import Cloud
-from forewarp.scene.frame import Scene, spread
 from forewarp.scene.view import Asks, Batch, Moment, Observation
 
 _FEWEST_TIMES = 8  # of training, for learned corrections of them
-_COUNTED_IMAGES = 12  # whose covered pixels are counted before a run
-_SLACK = 0.98  # of a side, as smaller images are not covered to exactly the same share
 # Parameters and buffers with a row for each particle; those of effects that are off are None.
 _ROWS = ("means", "scales", "quaternions", "opacity", "colors", "sh", "color_over_time", "opacity_over_time")
 _ROWS += ("gradient_sum", "image_count", "unseen_rounds", "resting")
@@ -61,6 +56,7 @@ class Particles(Method):
         start: what it is built from; for the stage's numbers see ``options.Numbers``.
         width: error at which the photometric loss turns from a square to a line.
         blur: square pixels added to the variance of every splat.
+        chunk: pairs of a splat and a pixel in memory at once, where there are no kernels.
         choices: see ``options.Effects``.
     """
 
@@ -68,7 +64,7 @@ class Particles(Method):
     numbers = tuple(key for key in Numbers.__dataclass_fields__ if key != "name")
     asks = Asks(kind="pictures", straight=True)
     effects = EFFECTS
-    on_cpu = "its kernels are the CPU's, and without them only small pictures are feasible"
+    on_cpu = "its kernels are the CPU's"
     planning: ClassVar[ParticlesPlanning] = ParticlesPlanning()
 
     # Scene queries: see ``methods.method``.
@@ -76,10 +72,13 @@ class Particles(Method):
     ellipsoids, template, movement = queries.ellipsoids, queries.template, queries.movement
     moving, in_motion, only = queries.moving, queries.in_motion, queries.only
 
-    def __init__(self, start: Start, *, width: float = 0.05, blur: float = BLUR, **choices) -> None:
+    def __init__(
+        self, start: Start, *, width: float = 0.05, blur: float = BLUR, chunk: int = CHUNK, **choices
+    ) -> None:
         super().__init__()
         self.stage = Numbers(name=start.stage, **start.numbers)
         self.canonical_time, self.width, self.blur = start.scene.canonical_time, width, blur
+        self.chunk = chunk
         self.views, times = len(start.scene.train), start.scene.times
         effects = Effects(**choices).only(self.stage.effects, len(times))
         self.ends = min(times), max(times)
@@ -150,42 +149,6 @@ class Particles(Method):
         self.register_buffer("final_count", torch.tensor(final_count))
         return values
 
-    @classmethod
-    def check_feasible(
-        cls, scene: Scene, stage: str, numbers: Mapping[str, Any], device: torch.device
-    ) -> None:
-        """See ``Method``: without kernels, refuse images too large for the particles that they call for.
-
-        The number of particles grows as the root of the covered pixels, so that splats times pixels grow as
-        the third power of an image's side.
-
-        Raises:
-            ValueError: naming a size that is feasible.
-
-        Cost: with kernels nothing, else a look at twelve images.
-        """
-        if has_kernels(device):
-            return
-        cameras = [frame.camera for frame in (*scene.train, *scene.held, *scene.val, *scene.test)]
-        width, height = max(((c.width, c.height) for c in cameras), key=lambda size: size[0] * size[1])
-        settings, views = Numbers(name=stage, **numbers), len(scene.train)
-        covered = covered_pixels(scene, spread(views, _COUNTED_IMAGES))
-        count = settings.final_count(covered, views) * max(settings.initial_share, settings.final_share)
-        scale = (FEASIBLE / (count * width * height)) ** (1 / 3)
-        if scale >= 1:
-            return
-        smaller_width, smaller_height = smaller(width, height, _SLACK * scale)
-        if device.type == "cpu":
-            key, why = "model", "have no kernels without Numba"
-            instead = "install forewarp[cpu] and leave FOREWARP_NUMBA unset"
-        else:
-            key, why, instead = "trainer", "have no kernels on a GPU", "use trainer=cpu"
-        raise ValueError(
-            f"{key}: expected pictures of at most {smaller_width} x {smaller_height} pixels, as particles "
-            f"{why}, but got {width} x {height} and {count:,.0f} particles; {instead}, "
-            "or use smaller pictures"
-        )
-
     @property
     def moves(self) -> bool:
         """Whether there is any motion."""
@@ -223,8 +186,8 @@ class Particles(Method):
 
     def at(self, moment: Moment) -> Snapshot:
         """Move every particle; nothing is rendered yet."""
-        bases = self.time_bases(moment.time)
-        return ParticlesSnapshot(moment, self.gaussians(), self.warp(moment.time), *bases, self.blur)
+        warp, bases = self.warp(moment.time), self.time_bases(moment.time)
+        return ParticlesSnapshot(moment, self.gaussians(), warp, *bases, self.blur, self.chunk)
 
     def gaussians(self) -> Gaussians:
         """Return the particles as the operators read them: coefficients of one kind in one tensor."""
@@ -305,7 +268,7 @@ class Particles(Method):
         compared = compare(
             self.gaussians(), warp, pinhole_of(seen.view.camera, self.blur), *self.time_bases(time),
             seen.rgb, seen.background, width=self.width, factor=factor, by_skin=self.moves,
-            kinds=[getattr(self, name).shape[1] for name in colors], loss=loss,
+            kinds=[getattr(self, name).shape[1] for name in colors], loss=loss, chunk=self.chunk,
         )  # fmt: skip
         squared = terms.pop("squared", compared.squared)
         terms = {name: value / covered for name, value in (terms or {"photo": compared.loss}).items()}
