@@ -72,7 +72,11 @@ def test_films_are_read_as_a_rig_whose_first_camera_is_held_out(films):
 def test_where_not_all_frames_fit_each_is_sought_in_its_film(films, monkeypatch):
     whole = [frame.load() for frame in read_scene(films, "toy").train]
     monkeypatch.setattr(CACHE, "limit", 2000)
-    for frame, expected in zip(read_scene(films, "toy").train, whole):
+    scene = read_scene(films, "toy")
+    (line,) = scene.protocol["assumed"]
+    assert "all frames take 1.23e-05 GB, more than data.cache_bytes" in line
+    assert line.endswith("mkdir cam00; ffmpeg -i cam00.mp4 cam00/%04d.png")
+    for frame, expected in zip(scene.train, whole):
         torch.testing.assert_close(frame.load(), expected, rtol=0, atol=0)
 
 

@@ -104,18 +104,14 @@ class Film:
     Args:
         path: of the video.
         stamps: seconds of its frames.
-        size: (width, height), what each has.
-        factor: average blocks of so many pixels a side.
+        size: (width, height), to which they are reduced.
         bytes_of_all: of the decoded frames of all cameras. Where there is room to keep them, the first frame
             that is needed has all of its video decoded; else each is sought in the file, which takes a tenth
             of a second and more.
     """
 
-    def __init__(
-        self, path: Path, stamps: np.ndarray, size: tuple[int, int], factor: int, bytes_of_all: int
-    ) -> None:
-        self.path, self.stamps, self.size, self.factor = path, stamps, size, factor
-        self.bytes_of_all = bytes_of_all
+    def __init__(self, path: Path, stamps: np.ndarray, size: tuple[int, int], bytes_of_all: int) -> None:
+        self.path, self.stamps, self.size, self.bytes_of_all = path, stamps, size, bytes_of_all
         self.images = tuple(FilmImage(self, number) for number in range(len(stamps)))
 
     def decoded(self, start: int, count: int) -> Iterator[Tensor]:
@@ -126,7 +122,9 @@ class Film:
         """
         gap = float(np.diff(self.stamps).min()) if len(self.stamps) > 1 else 1.0
         after = None if start == 0 else float(self.stamps[start]) - gap / 2
-        images = extracted(self.path, None, None, start=after)
+        images = extracted(
+            self.path, None, max(self.size), start=after
+        )  # ffmpeg averages several times as fast
         for index in range(start, start + count):
             pixels = next(images, None)
             if pixels is None:
@@ -136,7 +134,7 @@ class Film:
                 raise mismatch(f"{self.path}: frame {index}", by(self.size), by(pixels.shape[1::-1]))
             opaque = np.full((*pixels.shape[:2], 4), 255, np.uint8)
             opaque[..., :3] = pixels
-            yield reduced(torch.from_numpy(opaque), self.factor)
+            yield torch.from_numpy(opaque)
         images.close()
 
 
@@ -208,12 +206,21 @@ def read_scene(
     factors = [_factor(track, row, scale) for track, row in zip(tracks, rows)]
     cameras = [_camera(row, scale) for row in rows]
     bytes_of_all = 4 * count * sum(camera.width * camera.height for camera in cameras)
+    films = [track.path.name for track in tracks if track.stamps is not None]
+    if films and bytes_of_all > CACHE.limit:
+        line = (
+            f"all frames take {bytes_of_all / 1e9:.3g} GB, more than data.cache_bytes: each is sought in its"
+        )
+        stem = films[0].rsplit(".", 1)[0]
+        advice = f"faster are folders of frames, mkdir {stem}; ffmpeg -i {films[0]} {stem}/%04d.png"
+        assumed.append(f"{folder}: {line} film, which takes seconds; {advice}")
     loads = []
-    for track, factor in zip(tracks, factors):
+    for track, camera, factor in zip(tracks, cameras, factors):
         if track.stamps is None:
             loads.append([ReducedImage(path, track.size, factor) for path in track.images[:count]])
         else:
-            loads.append(Film(track.path, track.stamps[:count], track.size, factor, bytes_of_all).images)
+            size = (camera.width, camera.height)
+            loads.append(Film(track.path, track.stamps[:count], size, bytes_of_all).images)
     aslant = max(math.hypot(1, math.hypot(c.width / c.fx, c.height / c.fy) / 2) for c in cameras)
     near = min(row.near for row in rows) if near is None else number(near, "data.near", 0, MOST_UNITS)
     far = aslant * max(row.far for row in rows) if far is None else number(far, "data.far", 0, MOST_UNITS)
