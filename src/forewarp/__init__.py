@@ -38,9 +38,12 @@ def load(run, *, trust=(), device="cpu", data_root=None):
 def __getattr__(name: str):
     """Import the other names when they are first used, as torch takes a second."""
     if name == "__version__":
-        from importlib.metadata import version
+        from importlib.metadata import PackageNotFoundError, version
 
-        return version("forewarp")
+        try:
+            return version("forewarp")
+        except PackageNotFoundError:  # on PYTHONPATH, not installed
+            return "unknown"
     if name not in __all__:
         raise AttributeError(f"module 'forewarp' has no attribute '{name}'")
     from forewarp.scene import camera

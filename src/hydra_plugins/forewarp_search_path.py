@@ -13,6 +13,10 @@ class InstalledPackages(SearchPathPlugin):
         from forewarp.runs.config_files import installed, project_root
 
         main = [part.path for part in search_path.get_path() if part.provider == "main"]
-        if main and main[0].removeprefix("file://") == str(project_root() / "conf"):
+        try:
+            ours = str(project_root() / "conf")
+        except ValueError:  # there is none: this is another application
+            return
+        if main and main[0].removeprefix("file://") == ours:
             for package, folder in installed().items():
                 search_path.append(package, f"file://{folder}")

@@ -23,7 +23,7 @@ def test_every_mode_is_an_option():
 @pytest.mark.parametrize("model", FAMILIES)
 def test_a_mode_is_short_without_a_logger_and_in_a_folder_of_its_own(mode, model):
     config = composed(f"debug={mode}", f"model={model}", "data.scene=x", "preset=faithful")
-    assert (config.debug, config.logger, config.model.name) == (mode, None, model)
+    assert (config.debug, config.logger, config.model.name) == (mode, {}, model)
     assert config.budget.iterations <= 1000
     assert re.match(rf"runs/debug/x/{mode}-{model}-faithful-seed0-{{hash}}-\d{{4}}-\d{{6}}$", config.run)
     assert config.trainer.get("profiler") == ("simple" if mode == "profile" else None)
@@ -35,7 +35,8 @@ def test_a_mode_is_short_without_a_logger_and_in_a_folder_of_its_own(mode, model
 
 def test_what_is_typed_wins():
     words = ["debug=overfit", "data.train_views=5", "budget.iterations=7", "run=here", "data.scene=x"]
-    config = composed(*words)
+    config = composed(*words, "logger=csv")
+    assert list(config.logger) == ["csv"]
     assert (config.data.train_views, config.budget.iterations, config.run) == (5, 7, "here")
     assert composed("data.scene=x").debug is None
 

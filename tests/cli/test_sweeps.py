@@ -54,7 +54,7 @@ def test_a_sweep_without_a_name_has_a_folder_and_a_row_of_scores_for_each_job(ok
     ok(*words)
     folders = sorted(Path("runs/vehicle").iterdir())
     for folder, rate in zip(folders, ("0.1", "0.2"), strict=True):
-        assert re.fullmatch(rf"forward-demo-seed0-density-{rate}-\w{{10}}", folder.name)
+        assert re.fullmatch(rf"forward-demo-seed0-coarse-density-{rate}-\w{{10}}", folder.name)
         rows = read_rows(folder / "csv" / "metrics.csv")
         assert float(rows[-1]["test/space/psnr"]) > 0
         assert f"stage.coarse.lr.density: {rate}" in (folder / "csv" / "hparams.yaml").read_text()

@@ -10,7 +10,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from forewarp.files import read_json, read_rows
 from forewarp.training.callbacks import Scalars
-from forewarp.training.loggers import CsvLogger, RunLoggers, log_image
+from forewarp.training.loggers import CsvLogger, RunLoggers
 from tests.support.tiny_scene import Interrupt, make_run, stage
 
 STEPS = 6
@@ -24,10 +24,17 @@ SCORES = {"test/all/psnr": 30.5}
 
 
 class Note(lightning.Callback):
-    """Logs as any callback of Lightning's does."""
+    """Logs as callbacks of Lightning's do, in several hooks and in two ways."""
+
+    def on_train_start(self, trainer, module):
+        module.log("begin", 1.0)
 
     def on_train_batch_end(self, trainer, module, *_):
-        module.log("mine", float(module.run_step))
+        module.log("mine", float(module.global_step))
+
+    def on_train_epoch_end(self, trainer, module):
+        for logger in trainer.loggers:
+            logger.log_metrics({"end": 2.0}, module.global_step)
 
 
 def logged(folder, makers, *callbacks):
@@ -37,8 +44,8 @@ def logged(folder, makers, *callbacks):
     own = [Scalars(every=2), *callbacks]
     with loggers:
         module = make_run(folder / "run", stages, callbacks=own, loggers=loggers).fit()
-        log_image(loggers.open(module.run_step), "images/last", torch.rand(8, 8, 3), module.run_step)
-        loggers.log_scores(SCORES, module.run_step)
+        loggers.log_image("images/last", torch.rand(8, 8, 3), module.global_step)
+        loggers.log_scores(SCORES, 2 * STEPS)
 
 
 def interrupted_and_continued(folder, makers):
@@ -94,8 +101,33 @@ def test_what_others_log_is_on_the_axis_of_the_run(tmp_path, plain):
     run.callbacks = lambda *_: [Note()]
     with loggers:
         run.fit()
-    rows = [row for row in read_rows(tmp_path / "csv" / "metrics.csv") if row["mine"]]
-    assert [(int(row["step"]), float(row["mine"])) for row in rows] == [(50, 50), (100, 100)]
+    rows = read_rows(tmp_path / "csv" / "metrics.csv")
+    assert [(row["step"], row["mine"]) for row in rows if row["mine"]] == [("49", "50.0"), ("99", "50.0")]
+    assert [row["step"] for row in rows if row["end"]] == ["50", "100"]
+
+
+def test_a_run_outlives_a_tracker_that_fails(tmp_path, plain, capsys):
+    def broken(self, metrics, step):
+        raise ConnectionError("no route\nto host")
+
+    broken_logger = type("Broken", (CsvLogger,), {"log_metrics": broken})
+    logged(tmp_path, {"bad": partial(broken_logger, name="bad", version=""), **plain})
+    told = [line for line in capsys.readouterr().err.splitlines() if line.startswith("warning: ")]
+    assert told == ["warning: logger.bad failed and is left out from now on: ConnectionError: no route"]
+    assert read_rows(tmp_path / "run" / "csv" / "metrics.csv")[-1]["test/all/psnr"] == "30.5"
+
+
+def test_what_was_logged_before_the_first_checkpoint_is_not_there_twice(tmp_path, plain):
+    for steps in (3, 4):
+        loggers = RunLoggers(plain, tmp_path)
+        with loggers:
+            loggers.open()
+            for step in range(1, steps + 1):
+                loggers.log({"train/loss": 1.0}, step)
+    events = EventAccumulator(str(tmp_path / "tensorboard"))
+    events.Reload()
+    assert [point.step for point in events.Scalars("train/loss")] == [1, 2, 3, 4]
+    assert [row["step"] for row in read_rows(tmp_path / "csv" / "metrics.csv")] == ["1", "2", "3", "4"]
 
 
 @pytest.mark.filterwarnings("ignore:.*noload.*")  # SQLAlchemy's, of what MLflow calls

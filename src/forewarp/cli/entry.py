@@ -131,7 +131,7 @@ def _run(name: str, task: Callable, conf: Path, config_name: str) -> list[int]:
 
     # Travels with the job, as a launcher may not pass the environment on.
     trust = {TRUST_VARIABLE: os.environ[TRUST_VARIABLE]} if TRUST_VARIABLE in os.environ else {}
-    typed_once = {key_of(word) for word in sys.argv[1:] if word[0] != "-" and not is_sweep(word)}
+    typed_once = {key_of(word) for word in sys.argv[1:] if not word.startswith("-") and not is_sweep(word)}
 
     def job(config) -> object:
         # Caught here, as Hydra would print a message of its own.

@@ -119,11 +119,7 @@ class Job:
     lanes: list[list[Sweep]]
     then: list[list[str]]
     jobs: int = 1
-    small: tuple[str, str, str] = (
-        "0.01",
-        "4",
-        "1",
-    )  # with small=1: minutes, or steps, and test views of a run
+    small: tuple[str, str, str] = ("0.01", "4", "1")  # of a small run: minutes, or steps, and test views
 
 
 def plan_of(kind: str, keys: Keys) -> Job:

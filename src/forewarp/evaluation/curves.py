@@ -11,7 +11,6 @@ import lightning
 from forewarp.evaluation.evaluate import flow_error
 from forewarp.evaluation.images import validation_psnr
 from forewarp.files import read_json, read_rows, written_whole
-from forewarp.training.loggers import log_scalars
 
 FILE = "accuracy_time.csv"
 COLUMNS = ("seconds", "stage", "step", "psnr", "epe_moving", "size")
@@ -104,7 +103,7 @@ class AccuracyCurve(lightning.Callback):
                 writer.writeheader()
                 writer.writerows(self._rows)
             curve = {f"curve/{name}": value for name, value in scores.items()} | {"curve/seconds": seconds}
-            log_scalars(trainer.loggers, curve, module.run_step)
+            module.trackers.log(curve, module.global_step)
         self._next = next_moment(seconds, self.first, self.ratio)
 
 

@@ -21,7 +21,6 @@ from forewarp.drawing.images import (
 from forewarp.methods.method import HasTrajectories, Method, Snapshot
 from forewarp.scene.camera import Camera, focus_point, mean_up, orbit, swing
 from forewarp.scene.view import Moment, Rendering, Target, View
-from forewarp.training.loggers import log_image, log_scalars
 from forewarp.training.module import DynamicSceneModule
 
 PATHS = ("fixed", "swing", "orbit", "both", "trajectories")  # of videos
@@ -231,13 +230,13 @@ class TrainingImages(lightning.Callback):
         with module.clock.paused():
             for name, image in images_of(module, self._target(trainer.datamodule), self.size).items():
                 write_png(folder / f"{number}_{name}.png", image)
-                log_image(trainer.loggers, f"images/{name}", image, module.run_step)
+                module.trackers.log_image(f"images/{name}", image, module.global_step)
             views = trainer.datamodule.targets("val")
             count = min(self.psnr_views, len(views))
             if trainer.loggers and count:
                 chosen = [views[i * len(views) // count] for i in range(count)]
                 psnr = validation_psnr(module, chosen, self.psnr_rays)
-                log_scalars(trainer.loggers, {"val/psnr": psnr}, module.run_step)
+                module.trackers.log({"val/psnr": psnr}, module.global_step)
 
     def _target(self, datamodule) -> Target:
         targets = datamodule.targets("val" if datamodule.scene.val else "train")

@@ -80,7 +80,7 @@ _UNREADABLE = (
 _PARTS = {"name", "version", "sub_dir"}  # keys that make up the path a logger writes to
 # Its others.
 _PLAIN = {"default_hp_metric", "flush_logs_every_n_steps", "log_graph", "prefix"}
-_PLAIN |= {"project", "entity", "group", "tags", "notes", "job_type", "offline", "experiment_name"}
+_PLAIN |= {"project", "group", "tags", "notes", "job_type", "offline", "experiment_name"}
 _NAMED = ("model", "preset", "seed", "data", "data.root", "data.scene", "data.held_out")  # see ``in_words``
 UNUSED = ("logger", "callbacks")  # parts of a config that only training uses
 
@@ -100,9 +100,9 @@ def hashed(config: DictConfig) -> DictConfig:
         run += f"-{HASH}"
     if HASH in run:
         digits = content_hash(config)
-        path, name = Path(run).parent, Path(run).name
-        found = path.glob(glob.escape(name).replace(HASH, f"*{digits}"))
-        config.run = str(next(found, path / name.replace(HASH, "-".join(filter(None, (words, digits))))))
+        told = "-".join(filter(None, (words, digits)))
+        pattern = glob.escape(run).replace(HASH, f"*{digits}")
+        config.run = next(iter(sorted(glob.glob(pattern))), run.replace(HASH, told))
     return config
 
 
@@ -115,15 +115,19 @@ def in_words(overrides: Sequence[str]) -> str:
     """Name a job of a sweep by its overrides, but for what its folder's name says by itself.
 
     >>> in_words(["model=forward", "stage.fine.lr.means=1e-3", "model/view_dependence=sh", "~stage.coarse"])
-    'means-1e-3-view_dependence-sh-without-coarse'
+    'fine-means-1e-3-view_dependence-sh-without-coarse'
     """
     words = []
     for override in overrides:
         key, value = key_of(override), override.partition("=")[2]
-        first, last = re.split(r"[./]", key)[0], re.split(r"[./]", key)[-1]
+        first, *others = re.split(r"[./]", key)
+        name = "-".join(dict.fromkeys([*others[: first in ("stage", "objective")], *others[-1:]])) or first
         if first in (*IDENTITY, "ablation", "capture") and key not in _NAMED and value != "null":
-            words.append(f"without-{last}" if override.startswith("~") else f"{last}-{value}")
-    return re.sub(r"[^\w.-]+", "_", "-".join(words))[:60].strip("-_.")
+            word = f"without-{name}" if override.startswith("~") else f"{name}-{value}"
+            words.append(re.sub(r"[^\w.-]+", "_", word).strip("-_."))
+    while len(words) > 1 and len("-".join(words)) > 60:
+        words.pop()
+    return "-".join(words)[:60]
 
 
 def content_hash(config: DictConfig, more: Sequence[str] = (), *others: object) -> str:
@@ -145,7 +149,9 @@ def content_hash(config: DictConfig, more: Sequence[str] = (), *others: object) 
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:10]
 
 
-def saved_config(run: str | None, changes: DictConfig, key: str = "run") -> DictConfig:
+def saved_config(
+    run: str | None, changes: DictConfig, key: str = "run", unused: Sequence[str] = UNUSED
+) -> DictConfig:
     """Read the config in a run's folder and apply the changes that the command line may make.
 
     Args:
@@ -154,6 +160,7 @@ def saved_config(run: str | None, changes: DictConfig, key: str = "run") -> Dict
             and ``data.root`` are applied if they are not null. ``trust`` names packages whose code the run's
             config may name.
         key: name of the key that holds the folder, for errors.
+        unused: parts of the config that are left out, and need no trust.
 
     Raises:
         ValueError: if there is no run, a link lies in its folder, its scene is procedural and missing, or
@@ -166,8 +173,7 @@ def saved_config(run: str | None, changes: DictConfig, key: str = "run") -> Dict
         raise ValueError(
             f"{path}: expected the configuration of a run, but got none; set {key}=<a run's folder>"
         )
-    # Without trust, what serves training alone is left out rather than refused.
-    saved = read_config(path, trust_of(changes.get("trust")), () if key == "resume" else UNUSED)
+    saved = read_config(path, trust_of(changes.get("trust")), unused)
     for name in ("trainer", "threads", "lpips_weights", "sheets"):
         if changes.get(name) is not None:
             saved[name] = changes[name]
@@ -188,11 +194,13 @@ def resumed(config: DictConfig) -> DictConfig:
     """
     if config.get("resume") is None:
         return config
+    typed = typed_overrides(of_sweep=True) if HydraConfig.initialized() else []
+    replaced = ["logger"] if any(key_of(override).split(".")[0] == "logger" for override in typed) else []
     trust = OmegaConf.create({"trust": config.get("trust")})
-    saved = saved_config(str(config.resume), trust, "resume")
+    saved = saved_config(str(config.resume), trust, "resume", replaced)
     saved.resume, saved.data_changed = str(config.resume), "refuse"
     saved.paths = config.get("paths")  # where loggers write beside the run, as this command has it
-    for override in typed_overrides(of_sweep=True) if HydraConfig.initialized() else []:
+    for override in typed:
         key = key_of(override)
         if key == "data.root":
             saved.data.root = config.data.root
@@ -398,6 +406,11 @@ def check_target(name: object, where: Path | str, key: str, trust: Sequence[str]
     parts = name.split(".") if isinstance(name, str) else []
     if len(parts) < 2 or not all(part.isidentifier() for part in parts):
         raise ValueError(refusal)
+    if name.startswith("lightning.pytorch.loggers."):
+        known = sorted(
+            one.rpartition(".")[2] for one in ELSEWHERE if one.startswith(parts[0] + ".pytorch.log")
+        )
+        raise ValueError(f"{refusal}; a folder may name {', '.join(known)}; add logger=NAME to resume=")
     if parts[0] != "forewarp":
         _check_foreign(name, refusal, trust)
         return

@@ -105,7 +105,7 @@ class Renderable:
         if not isinstance(camera, Camera):
             camera = replace(self.cameras[0], camera_to_world=_rigid(camera))
         time = frame.time if time is None and frame is not None else time
-        if np.ndim(time) or time is None or not 0 <= time <= 1:
+        if not isinstance(time, int | float | np.number | Tensor) or np.ndim(time) or not 0 <= time <= 1:
             raise ValueError(f"time: expected a number in [0, 1], but got {time}")
         behind = self.background if background is None else _color(background)
         moment = Moment(float(time), camera=None if frame is None else frame.camera_id)

@@ -12,7 +12,6 @@ from collections import defaultdict
 import lightning
 
 from forewarp.progress import ProgressLine, time_text
-from forewarp.training.loggers import log_scalars
 
 _SMOOTHING = 0.02  # weight of the newest step in the PSNR shown: a mean over about 50 steps
 
@@ -122,4 +121,4 @@ class Scalars(lightning.Callback):
         for group in trainer.optimizers[0].param_groups:
             scalars[f"lr/{group['name']}"] = group["lr"]
         with module.clock.paused():
-            log_scalars(trainer.loggers, scalars, module.run_step)
+            module.trackers.log(scalars, module.global_step)

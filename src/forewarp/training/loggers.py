@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import csv
 import os
-from collections.abc import Callable, Mapping, Sequence
-from functools import cache
+import sys
+from collections.abc import Callable, Mapping
+from contextlib import nullcontext
+from functools import cache, partial
 from importlib.util import find_spec
 from pathlib import Path
 
+from filelock import FileLock
 from lightning.pytorch.loggers import CSVLogger, Logger, MLFlowLogger, TensorBoardLogger, WandbLogger
 from lightning.pytorch.loggers.csv_logs import ExperimentWriter
 from torch import Tensor
@@ -74,6 +77,8 @@ class RunLoggers:
         self.hyperparameters = cache(hyperparameters)
         self._open: dict[str, Logger] | None = None
         self._closing: list[Callable[[str], None]] = []
+        self._failed: set[str] = set()
+        self.before = 0  # steps of the earlier stages
         for name, maker in self.makers.items():
             package = _PACKAGES.get(_class_of(maker), "lightning")
             if find_spec(package) is None:
@@ -81,98 +86,143 @@ class RunLoggers:
                     f"logger: expected {package} for {name}, but got none; install forewarp[trackers]"
                 )
 
-    def open(self, step: int) -> list[Logger]:
-        """List the open loggers; those of a run that goes on leave out what they have after ``step``."""
+    def open(self, before: int = 0, step: int = 0) -> list[Logger]:
+        """List the open loggers. From now on they log a stage's steps on the axis of the run.
+
+        Args:
+            before: steps of the run's earlier stages.
+            step: of the stage, from which it goes on; later ones are left out of TensorBoard and CSV files,
+                and stay in other trackers beside what is made again.
+
+        Raises:
+            ValueError: if a tracker does not take the run.
+        """
+        self.before = before
         if self._open is None:
             self._open, ids = {}, read_json(self.folder / IDS) or {}
             for name, maker in self.makers.items():
                 try:
-                    self._open[name] = self._begin(name, maker, step, ids)
+                    self._open[name] = self._begin(name, maker, before + step, ids)
                 except (OSError, KeyboardInterrupt):
                     raise
                 except Exception as error:  # of the tracker's own kinds
-                    got = f"{type(error).__name__}: {(str(error).splitlines() or [''])[0]}"
                     raise ValueError(
-                        f"logger.{name}: expected a tracker that takes this run, but got {got}; mend it, or "
-                        "leave it out of logger=[...]"
+                        f"logger.{name}: expected a tracker that takes this run, but got "
+                        f"{_in_a_line(error)}; mend it, or leave it out of logger=[...]"
                     ) from error
             if ids:
                 write_json(self.folder / IDS, ids)
         return list(self._open.values())
 
     def _begin(self, name: str, maker: Callable[..., Logger], step: int, ids: dict[str, str]) -> Logger:
-        kind, known = _class_of(maker), name in ids
+        kind, known = _class_of(maker), ids.get(name)
         title = "/".join(self.folder.resolve().parts[-2:])
-        if kind is WandbLogger:
-            self.runs.mkdir(parents=True, exist_ok=True)  # its links may not lie in a run's folder
-            logger = maker(save_dir=str(self.runs), name=title, id=ids.get(name))
-        elif kind is MLFlowLogger:
-            where = {
-                "tracking_uri": maker.keywords.get("tracking_uri") or os.environ.get("MLFLOW_TRACKING_URI")
-            }
-            if where["tracking_uri"] is None:
-                self.runs.mkdir(parents=True, exist_ok=True)
-                here = self.runs.resolve()
-                where = {"tracking_uri": f"sqlite:///{here}/mlflow.db", "artifact_location": f"{here}/mlflow"}
-            logger = maker(**where, run_name=title, run_id=ids.get(name))
-        elif kind is TensorBoardLogger:
-            logger = maker(save_dir=str(self.folder), purge_step=step + 1 if step else None)
-        elif kind is CsvLogger:
-            logger = maker(save_dir=str(self.folder), first=step)
-        else:
-            logger = maker(save_dir=str(self.folder))
-        _ = logger.experiment  # connects
+        if kind in _PACKAGES:
+            self.runs.mkdir(parents=True, exist_ok=True)
+        # Only one job of a sweep may make the database.
+        with FileLock(self.runs / ".mlflow.lock") if kind is MLFlowLogger else nullcontext():
+            if kind is WandbLogger:  # its links may not lie in a run's folder
+                logger = maker(save_dir=str(self.runs), name=title, id=known)
+            elif kind is MLFlowLogger:
+                logger = maker(**self._store(maker), run_name=title, run_id=known)
+            elif kind is TensorBoardLogger:
+                logger = maker(save_dir=str(self.folder), purge_step=step + 1)
+            elif kind is CsvLogger:
+                logger = maker(save_dir=str(self.folder), first=step)
+            else:
+                logger = maker(save_dir=str(self.folder))
+            _ = logger.experiment  # connects
         if kind in _PACKAGES:
             ids[name] = str(logger.version)
         if not (known and kind is MLFlowLogger):  # which takes each parameter once
             logger.log_hyperparams(dict(self.hyperparameters()))
         self._closing.append(logger.finalize)
+        log_metrics = logger.log_metrics
+
+        def log_on_the_runs_axis(metrics: Mapping[str, float], step: int | None = None) -> None:
+            step = None if step is None else step + self.before
+            self._guard(name, lambda: log_metrics(metrics, step))
+
         logger.finalize = lambda status: logger.save()  # Lightning calls it after each stage
+        logger.log_metrics = log_on_the_runs_axis
         return logger
 
+    def _store(self, maker: Callable[..., Logger]) -> dict[str, str]:
+        """Return where MLflow writes: as typed, as in the environment, or else beside all runs."""
+        uri = maker.keywords.get("tracking_uri") or os.environ.get("MLFLOW_TRACKING_URI")
+        if uri:
+            return {"tracking_uri": uri}
+        here = self.runs.resolve()
+        return {"tracking_uri": f"sqlite:///{here}/mlflow.db", "artifact_location": f"{here}/mlflow"}
+
+    def _guard(self, name: str, call: Callable[[], None]) -> None:
+        """Let a run outlive a tracker that fails: tell it once, and leave it out from then on."""
+        if name in self._failed:
+            return
+        try:
+            call()
+        except Exception as error:  # of the tracker's own kinds
+            self._failed.add(name)
+            print(
+                f"warning: logger.{name} failed and is left out from now on: {_in_a_line(error)}",
+                file=sys.stderr,
+            )
+
+    def log(self, scalars: Mapping[str, float], step: int) -> None:
+        """Log scalars of a step of the stage that ``open`` has begun.
+
+        Not by Lightning's ``self.log``, which repeats at every later step what was logged once.
+        """
+        for name, logger in (self._open or {}).items():
+            logger.log_metrics(dict(scalars), step)
+            self._guard(name, logger.save)
+
+    def log_image(self, title: str, image: Tensor, step: int) -> None:
+        """Log an image (H, W, 3) in [0, 1] of a step of the stage to each logger that takes images."""
+        pixels, at = to_bytes(image), step + self.before
+        for name, logger in (self._open or {}).items():
+            if isinstance(logger, TensorBoardLogger):
+                add = partial(logger.experiment.add_image, title, pixels, at, dataformats="HWC")
+            elif isinstance(logger, MLFlowLogger):
+                add = partial(logger.experiment.log_image, logger.run_id, pixels, key=title, step=at)
+            elif hasattr(logger, "log_image"):  # Weights & Biases, and loggers made like it
+                add = partial(logger.log_image, title, [pixels], step=step)
+            else:
+                continue
+            self._guard(name, add)
+
     def log_scores(self, scores: Mapping[str, float], step: int) -> None:
-        """Log the scores of a measured run, in TensorBoard beside its hyperparameters (HPARAMS)."""
-        for logger in self.open(step):
+        """Log the scores of a measured run, in TensorBoard beside its hyperparameters (HPARAMS).
+
+        Args:
+            scores: by name.
+            step: steps of the whole run.
+        """
+        self.open(0, step)
+        for logger in self._open.values():
             if isinstance(logger, TensorBoardLogger):
                 logger.log_hyperparams(dict(self.hyperparameters()), dict(scores), step)
-            else:
-                logger.log_metrics(dict(scores), step)
-            logger.save()
+        others = {name: one for name, one in self._open.items() if not isinstance(one, TensorBoardLogger)}
+        for logger in others.values():
+            logger.log_metrics(dict(scores), step)
+        for name, logger in self._open.items():
+            self._guard(name, logger.save)
 
     def __enter__(self) -> RunLoggers:
         return self
 
     def __exit__(self, kind: type | None, *_) -> None:
         """Close all loggers, as failed after an exception."""
-        for close in self._closing:
-            close("success" if kind is None else "failed")
-        for logger in (self._open or {}).values():
+        for (name, logger), close in zip((self._open or {}).items(), self._closing):
+            self._guard(name, partial(close, "success" if kind is None else "failed"))
             if isinstance(logger, WandbLogger):  # else the next job of a sweep would go on in this run
-                logger.experiment.finish(exit_code=0 if kind is None else 1)
+                self._guard(name, partial(logger.experiment.finish, exit_code=0 if kind is None else 1))
         self._open, self._closing = None, []
-
-
-def log_scalars(loggers: Sequence[Logger], scalars: Mapping[str, float], step: int) -> None:
-    """Log scalars of a step of the run, counted over all its stages (``module.run_step``).
-
-    Not by Lightning's ``self.log``, which repeats at every later step what was logged once.
-    """
-    for logger in loggers:
-        logger.log_metrics(dict(scalars), step)
-        logger.save()
-
-
-def log_image(loggers: Sequence[Logger], name: str, image: Tensor, step: int) -> None:
-    """Log an image (H, W, 3) in [0, 1] to each logger that takes images."""
-    pixels = to_bytes(image)
-    for logger in loggers:
-        if isinstance(logger, TensorBoardLogger):
-            logger.experiment.add_image(name, pixels, step, dataformats="HWC")
-        elif isinstance(logger, MLFlowLogger):
-            logger.experiment.log_image(logger.run_id, pixels, key=name, step=step)
-        elif hasattr(logger, "log_image"):  # Weights & Biases, and loggers made like it
-            logger.log_image(name, [pixels])
 
 
 def _class_of(maker: Callable[..., Logger]) -> type:
     return getattr(maker, "func", maker)
+
+
+def _in_a_line(error: Exception) -> str:
+    return f"{type(error).__name__}: {(str(error).splitlines() or [''])[0]}"

@@ -14,6 +14,7 @@ from forewarp.methods.method import Method, Snapshot, Step
 from forewarp.progress import told_if_slow
 from forewarp.scene.camera import Camera
 from forewarp.scene.view import Batch, Moment, Rendering, Target, View
+from forewarp.training.loggers import RunLoggers
 from forewarp.training.objective import Objective, set_gradients, total
 from forewarp.training.schedule import Curriculum, StageSettings
 
@@ -28,8 +29,8 @@ class DynamicSceneModule(lightning.LightningModule):
         curriculum: draws the frame of every step.
         seed: seed of the random numbers that the method draws.
 
-    ``last`` holds the values of the last step, by the names under which they are logged; ``steps_before``
-    the steps of the run's earlier stages.
+    ``last`` holds the values of the last step, by the names under which they are logged; ``trackers`` are the
+    loggers of the run.
     """
 
     def __init__(
@@ -50,7 +51,7 @@ class DynamicSceneModule(lightning.LightningModule):
         self.generator = torch.Generator().manual_seed(seed)
         self.clock = Clock()
         self.last: dict[str, float] = {}
-        self.steps_before = 0
+        self.trackers = RunLoggers()
         self._noted: Mapping[str, float] = {}
         self._torch_state: Tensor | None = None
 
@@ -66,26 +67,13 @@ class DynamicSceneModule(lightning.LightningModule):
         """Fraction of the stage that is done, in [0, 1]."""
         return self.settings.fraction(self.global_step, self.clock.seconds)
 
-    @property
-    def run_step(self) -> int:
-        """Steps of the run so far, over all its stages: the axis of everything that is logged."""
-        return self.steps_before + self.global_step
-
-    def log(self, name: str, value: float | Tensor, *given, **options) -> None:
-        """Log a value as Lightning does, on the axis of the run."""
-        if self.trainer.training and name != "step":
-            super().log("step", float(self.run_step), on_step=True, on_epoch=False)
-        super().log(name, value, *given, **options)
-
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
         """Take one step of the optimiser, and return the loss.
 
         Optimisation is manual, as a method may compute its gradients itself.
         """
-        optimizer, profiled = (
-            self.optimizers(),
-            self.trainer.profiler.profile,
-        )  # debug=profile shows these parts
+        optimizer = self.optimizers()
+        profiled = self.trainer.profiler.profile  # debug=profile shows these parts
         for group in optimizer.param_groups:
             for parameter in group["params"]:
                 parameter.grad = None

@@ -125,12 +125,12 @@ class Run:
             clock = Clock(self.clock)
             with clock.running():  # a hull, a plane sweep
                 module = self._module(stage, module, handover, blank=blank)
-            module.clock, module.steps_before = Clock(self.clock) if blank else clock, steps
+            module.clock = Clock(self.clock) if blank else clock
             if done:
                 load_weights(module, folder / "last.ckpt")
                 self.tell(f"{stage.settings.name}: finished before")
             else:
-                self._fit_stage(stage, module, handover)
+                self._fit_stage(stage, module, handover, steps)
             steps += int(_done(folder)["steps"])
             handover = load_handover(folder)
         return module
@@ -226,7 +226,9 @@ class Run:
             method, objective=objective, settings=settings, curriculum=curriculum, seed=seed
         )
 
-    def _fit_stage(self, stage: Stage, module: DynamicSceneModule, before: Handover | None) -> None:
+    def _fit_stage(
+        self, stage: Stage, module: DynamicSceneModule, before: Handover | None, steps_before: int
+    ) -> None:
         """Train a stage to its end, from its checkpoint if it has one, and write what it leaves."""
         settings, folder = stage.settings, self.stage_folder(stage)
         last = folder / "last.ckpt"
@@ -237,7 +239,7 @@ class Run:
             steps, seconds = check_state(checkpoint, module)
             fraction = module.settings.fraction(steps, seconds)
             self.tell(f"{settings.name}: goes on at {fraction:.0%}, step {steps}")
-        loggers = self.loggers.open(module.steps_before + steps)
+        loggers, module.trackers = self.loggers.open(steps_before, steps), self.loggers
         callbacks = [sentinel, *self.callbacks(settings.name, folder), keeper]
         trainer = self.make_trainer(folder, callbacks, loggers)
         reset_peak_memory()
