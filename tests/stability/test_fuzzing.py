@@ -23,8 +23,9 @@ from hypothesis import strategies as st
 from omegaconf import OmegaConf
 
 from forewarp.cli.entry import one_line
-from forewarp.data import dnerf, hypernerf, nhr, posed_video
+from forewarp.data import dnerf, hypernerf, multicam, nhr, posed_video
 from forewarp.data.files import SceneError
+from forewarp.data.images import write_image
 from forewarp.runs.build import build_run
 from forewarp.runs.config import saved_config
 from forewarp.scene.frame import Scene
@@ -37,9 +38,12 @@ from tests.support.written_scenes import (
     dnerf_shots,
     dome,
     dome_truth,
+    fixed_cameras,
+    grey,
     rig,
     write_dnerf,
     write_dome,
+    write_multicam,
     write_rig,
     write_video,
 )
@@ -224,11 +228,22 @@ def video(folder):
     write_video(folder, times=[i / 9 for i in range(10)], channels=4)
 
 
+def films(folder):
+    """A film, and folders of frames."""
+    cameras = fixed_cameras(3, size=(16, 24))
+    write_multicam(folder, cameras[:1], count=2)
+    for k, camera in enumerate(cameras[1:], 1):
+        for n in range(2):
+            write_image(folder / f"cam{k:02d}" / f"{n}.png", grey(camera, n, k))
+    multicam.write_poses(folder, cameras, near=14.0, far=30.0)
+
+
 FORMATS = {
     "dnerf": (write_dnerf, dnerf.read_scene),
     "lego_complete": (three_kinds, dnerf.read_lego_complete),
     "hypernerf": (two_phones, hypernerf.read_scene),
     "nhr": (small_dome, nhr.read_scene),
+    "multicam": (films, multicam.read_scene),
     "video_with_poses": (video, posed_video.read_scene),
 }
 
