@@ -209,7 +209,7 @@ def comparison(table: PaperTable, runs: Runs, numbers: Mapping[str, int] | None 
         lines += [[printed.name, "published", *printed.values, *no_costs]] if printed else []
         for of_row in of_method:
             cells = cells_of(of_row, table)
-            lines.append([name_of(of_row), "measured", *cells, *costs_of(of_row, numbers)])
+            lines.append([name_of(of_row, found), "measured", *cells, *costs_of(of_row, numbers)])
             if printed and any(cells):
                 both = zip(cells, printed.values)
                 differences = [Difference(cell.mean - float(v)) if cell and v else None for cell, v in both]
@@ -239,7 +239,7 @@ def stand_in(table: PaperTable, runs: Runs, numbers: Mapping[str, int] | None = 
         printed, own = table.printed(of_row[0]), {dataset_of(run) for run in of_row}
         values = [printed.values[i] if printed and group.dataset in own else "" for i, group in shown]
         beside = [printed.name if printed else "", *values]
-        lines.append([name_of(of_row), *cells_of(of_row, made), *costs_of(of_row, numbers), *beside])
+        lines.append([name_of(of_row, found), *cells_of(of_row, made), *costs_of(of_row, numbers), *beside])
     columns = ["measured", *(_column(*column) for column in made.columns), *COSTS, "published as"]
     columns += [f"published: {group.name} PSNR" for _, group in shown]
     return Table(columns, lines, marks=_marks(found, made, lines, 1)).filled()
@@ -289,17 +289,25 @@ def with_means(table: PaperTable, runs: Runs) -> PaperTable:
     return replace(table, groups=groups, rows=rows)
 
 
-def name_of(runs: Runs) -> str:
-    """Name a measured row: method or variant, and its conditions."""
-    run, seeds = runs[0], len(runs.by("seed"))
+def name_of(runs: Runs, among: Sequence[Runs]) -> str:
+    """Name a measured row: method or variant, and its conditions where those of the table differ."""
+    run = runs[0]
     about = run["method"] if run["ablation"] is None else run["about"] or run["ablation"]
-    parts = [f"forewarp: {about}" + " (the paper's method)" * (about == "forward"), run["preset"]]
+    name, own = f"forewarp: {about}" + " (the paper's method)" * (about == "forward"), _conditions(runs)
+    alike = len(among) > 1 and all(_conditions(other) == own for other in among)
+    return name if alike else ", ".join([name, *own])
+
+
+def _conditions(runs: Runs) -> list[str]:
+    run, seeds = runs[0], len(runs.by("seed"))
+    parts = [run["preset"]]
     if run["minutes"]:
         parts.append(f"{run['minutes']:g} min" + " of processor time" * (run["clock"] == "processor"))
     parts += [f"{run['iterations']} steps"] if run["iterations"] else []
     parts += [f"{seeds} seeds"] if seeds > 1 else []
     parts += [f"{run['held_out']} views held out"] if run["held_out"] else []
-    return ", ".join(parts + ([f"{run['tested']} test views"] if run["tested"] else []))
+    views = run["tested"]
+    return parts + ([f"{views} test view{'s' * (views != 1)}"] if views else [])
 
 
 def _column(group: Group, metric: str) -> Column:
