@@ -62,6 +62,19 @@ def test_a_target_of_ones_own_and_what_has_no_curve(tmp_path):
     assert "* hypernerf" not in page  # whose means say nothing of this scene
 
 
+def test_some_training_views_are_no_seed_of_all_of_them(tmp_path):
+    few = {"protocol": {"train_views": 16}}
+    write_run(tmp_path / "a", "base", 0)
+    write_run(tmp_path / "b", "base", 1, metrics=few)
+    write_run(tmp_path / "b", "data.train_views=16", 0, metrics=few)  # whose number is the choice
+    page, *files = write_accuracy_time(tmp_path, tmp_path / "out")
+    _, all_views, some_views = page.read_text().split("## ball")
+    assert rows_of(all_views, "base")[0][2] == rows_of(some_views, "base")[0][2] == "1"
+    assert rows_of(all_views, "data.train_views=16")
+    assert some_views.startswith(" (16 training views)\n")
+    assert files[-1].name == "accuracy-time-ball-16-training-views.csv"
+
+
 def test_changes_are_against_the_same_seed(tmp_path):
     runs = tmp_path / "runs"
     write_run(runs, "base", 0, psnr=30.0, epe=0.2)

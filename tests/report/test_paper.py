@@ -88,6 +88,18 @@ def test_seeds_give_a_deviation_where_all_scenes_have_them(tmp_path):
     assert cells(table_of(tmp_path), f"{OURS}, 3 seeds")[0] == "21.00 ± 1.41"
 
 
+def test_some_training_views_neither_replace_nor_join_all_of_them(tmp_path):
+    old = paper_run(tmp_path / "all", "toy", made=True, psnr=30.0)
+    os.utime(old / "metrics.json", (1, 1))
+    for seed in (0, 1):
+        paper_run(tmp_path / "some", "toy", seed=seed, made=True, psnr=20.0, protocol={"train_views": 16})
+    write_paper(tmp_path, tmp_path / "out")
+    text = re.sub(" +", " ", (tmp_path / "out" / "paper.md").read_text())
+    assert f"| {OURS} | 30.00 |" in text
+    assert f"| {OURS}, 2 seeds, 16 training views | 20.00 ± 0.00 |" in text
+    assert "is newer" not in text
+
+
 def test_ranks_are_among_measured_rows_alone(tmp_path):
     for variant, psnr, lpips in (("full", 25.0, 0.2), ("no_tv", 24.0, 0.1), ("no_view", 20.0, 0.3)):
         for scene in ALL[:4]:

@@ -78,6 +78,14 @@ def test_folders_without_results_are_named_and_the_others_read(tmp_path):
         read_runs(tmp_path / "none")
 
 
+def test_debug_runs_are_counted_and_left_out(tmp_path):
+    write_run(tmp_path, "base")
+    for name in ("fast", "limit"):
+        write_run(tmp_path, name, config={"debug": name}, psnr=None if name == "fast" else 30.0)
+    runs, left_out = read_runs(tmp_path)
+    assert (list(runs.by("variant")), left_out) == (["base"], ["left out: debug runs: 2"])
+
+
 def test_groups_hold_the_seeds_and_the_base_comes_first(tmp_path):
     for variant, seed, minutes in (("a", 1, 1.0), ("a", 0, 1.0), ("base", 0, 1.0), ("a", 0, 3.0)):
         write_run(tmp_path, variant, seed, minutes=minutes)

@@ -6,6 +6,7 @@ Functions that write search a folder for measured runs, write to ``out``, and re
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from statistics import fmean, mode
@@ -55,6 +56,17 @@ def by_variant(runs: Runs) -> dict[str, Runs]:
     return dict(sorted(runs.by("variant").items(), key=lambda item: item[0] != "base"))
 
 
+def _read(folder: Path, needed: Sequence[str] = ("metrics.json",)) -> tuple[Runs, list[str]]:
+    """Read runs as ``read_runs`` does; a scene with some of its training views is another scene, unless their
+    number is the choice that is compared.
+    """
+    runs, left_out = read_runs(folder, needed)
+    for row in runs:
+        if row["train_views"] and "train_views" not in row["variant"]:
+            row["scene"] += f" ({row['train_views']} training views)"
+    return runs, left_out
+
+
 def write_accuracy_time(
     folder: Path, out: Path, *, target: float | None = None, published: Sequence = ()
 ) -> list[Path]:
@@ -66,13 +78,14 @@ def write_accuracy_time(
             the best run, reached.
         published: results of others, drawn as stars.
     """
-    runs, left_out = read_runs(folder, ["accuracy_time.csv", "metrics.json"])
+    runs, left_out = _read(folder, ["accuracy_time.csv", "metrics.json"])
     scenes, written = [], []
     for scene, found in runs.by("scene").items():
         groups = {}
         for variant, group in by_variant(found).items():
             groups |= {(variant, minutes): same for minutes, same in group.by("minutes").items()}
-        picture, file = out / f"accuracy-time-{scene}.png", out / f"accuracy-time-{scene}.csv"
+        name = "accuracy-time-" + re.sub(r"[^\w.-]+", "-", scene).strip("-")
+        picture, file = out / f"{name}.png", out / f"{name}.csv"
         beside = [other for other in published if other.dataset == found[0]["dataset"]]
         draw_scene(picture, groups, scene, beside)
         curves = [row["points"] for row in found.where(variant="base") or found]
@@ -132,7 +145,7 @@ def write_price_list(folder: Path, out: Path) -> list[Path]:
 
     The model is that of most runs: what is changed one at a time, beside which whole methods may stand.
     """
-    runs, left_out = read_runs(folder)
+    runs, left_out = _read(folder)
     scenes = []
     for (scene, minutes), found in runs.by("scene", "minutes").items():
         bound = f"{minutes:g} minutes" if minutes else "bounded by steps"
@@ -197,7 +210,7 @@ def write_effects(folder: Path, out: Path) -> list[Path]:
     """Write ``effects.md`` and ``effects.csv`` (every run) of ``model=forward``, and ``effects-<model>`` of
     any other method.
     """
-    runs, left_out = read_runs(folder)
+    runs, left_out = _read(folder)
     runs, files = Runs(row for row in runs if row["ablation"] in CHOICES), []
     for model, own in (runs.by("method") or {"forward": runs}).items():
         name = "effects" if model == "forward" else f"effects-{model}"

@@ -26,7 +26,8 @@ from forewarp.report.tables import Cell, Column, Difference, Section, Table, ren
 
 PAPER = Path(__file__).with_name("paper.yaml")  # the printed numbers
 # What the runs of one row of a table have in common.
-BUDGET = ("preset", "minutes", "iterations", "held_out", "device", "threads", "clock", "tested")
+BUDGET = ("preset", "minutes", "iterations", "held_out", "train_views")
+BUDGET += ("device", "threads", "clock", "tested")
 ROW = ("ablation", "method", *BUDGET)
 UNPRINTED = ("particles", "backward")  # methods of this project that the paper prints no row of
 METHODS = ("particles", "forward", "backward")  # that are compared in pictures
@@ -306,6 +307,7 @@ def _conditions(runs: Runs) -> list[str]:
     parts += [f"{run['iterations']} steps"] if run["iterations"] else []
     parts += [f"{seeds} seeds"] if seeds > 1 else []
     parts += [f"{run['held_out']} views held out"] if run["held_out"] else []
+    parts += [f"{run['train_views']} training views"] if run["train_views"] else []
     views = run["tested"]
     return parts + ([f"{views} test view{'s' * (views != 1)}"] if views else [])
 
@@ -586,7 +588,7 @@ def _label(run: Row, others: Sequence[Row]) -> str:
     """Name a run's budget, with what else tells it from the others."""
     parts = [f"{run['minutes']:g} min"] if run["minutes"] else []
     parts += [f"{run['iterations']} steps"] if run["iterations"] else []
-    for name in ("preset", "device", "threads", "clock", "tested", "held_out"):
+    for name in ("preset", "device", "threads", "clock", "tested", "held_out", "train_views"):
         several = len({other[name] for other in others}) > 1
         parts += [f"{name.replace('_', ' ').replace('tested', 'views')} {run[name]}"] if several else []
     return ", ".join(parts)

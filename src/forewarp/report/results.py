@@ -35,6 +35,7 @@ CONDITIONS = {
     "pictures": "{}",
     "iterations": "{:g} steps at most",
     "held_out": "{:g} views held out",
+    "train_views": "{:g} training views",
     "density": "stage.fine.density={:g}",
     "steps_per_picture": "stage.fine.steps_per_picture={}",
 }
@@ -70,6 +71,7 @@ PROTOCOL = (
     "frames",
     "views",
     "train_frames",
+    "train_views",
     "test_views",
     "test_cameras",
     "test_moments",
@@ -202,19 +204,20 @@ class Runs(list[Row]):
 
 
 def read_runs(root: Path, needed: Sequence[str] = ("metrics.json",)) -> tuple[Runs, list[str]]:
-    """Read all runs below a folder.
+    """Read all runs below a folder but those for debugging, which are too short to be compared.
 
     Args:
         root: folder to search for ``config.yaml``.
         needed: files that a run must hold.
 
     Returns:
-        the runs in the order of their folders, and a line for each run that cannot be used.
+        the runs in the order of their folders, and a line for each run that cannot be used, and one for all
+        for debugging.
 
     Raises:
         ValueError: if there is no run at all.
     """
-    runs, left_out = Runs(), []
+    runs, left_out, debugging = Runs(), [], 0
     for folder in sorted(path.parent for path in Path(root).rglob("config.yaml")):
         absent = [name for name in needed if not (folder / name).is_file()]
         try:
@@ -222,13 +225,16 @@ def read_runs(root: Path, needed: Sequence[str] = ("metrics.json",)) -> tuple[Ru
         except UNREADABLE as error:
             left_out.append(f"{folder.relative_to(root)}: cannot be read ({unreadable(error)})")
             continue
-        if absent:
+        if row["config"].get("debug"):
+            debugging += 1
+        elif absent:
             again = "run its command again"
             if absent == ["accuracy_time.csv"]:  # no views were held out
                 again = "run its command with data.held_out=8 into another folder"
             left_out.append(f"{folder.relative_to(root)}: no {', '.join(absent)}; {again}")
         else:
             runs.append(row)
+    left_out += [f"left out: debug runs: {debugging}"] if debugging else []
     if not runs and not left_out:
         raise ValueError(
             f"{root}: expected folders of runs, but got none; make some with forewarp-train, or set runs=..."
@@ -294,6 +300,7 @@ def read_run(folder: Path) -> Row:
     row |= {name: protocol.get(name) for name in ("threads", "device", "commit", "departures", "faults")}
     row |= {"torch": protocol.get("versions", {}).get("torch"), "held_out": protocol.get("held_out") or None}
     row |= {"measured": protocol.get("measured", f"all {frames} test views" if frames else None)}
+    row |= {"train_views": protocol.get("train_views")}
     row |= {"tested": int(tested) if tested.isdigit() else None}  # as of "10 of 30 test views, evenly spread"
     row |= {"counterpart": synthetic, "dataset": COUNTERPART * stands_in + dataset}
     row |= {"day": datetime.fromtimestamp(measured_at / 1e9, timezone.utc).date().isoformat()}
@@ -409,7 +416,7 @@ def add_to_table(file: Path, rows: Iterable[Row]) -> Runs:
 def _read(row: dict[str, str]) -> Row:
     """Turn a row of a CSV file into one of ``read_run``; an older table lacks some columns."""
     scores = [*SCORES, *(name for name in row if name not in (*KEY, *SCORES, *NUMBERS, *TEXTS))]
-    numbers = ("minutes", "threads", "iterations", "held_out", "density", *scores, *NUMBERS)
+    numbers = ("minutes", "threads", "iterations", "held_out", "train_views", "density", *scores, *NUMBERS)
     typed = {name: row.get(name) or None for name in (*KEY, *TEXTS)}
     typed |= {name: _number(row.get(name)) for name in numbers}
     if " scene=counterpart_" in (typed["command"] or "") and not typed["dataset"].startswith("counterpart"):
