@@ -66,6 +66,21 @@ def test_conditions_in_which_runs_differ_are_told_and_what_one_lacks_has_no_row(
     assert rows["views held out"] == ["none named", "8", None]
 
 
+def test_other_scenes_have_no_difference_and_other_kinds_of_view_no_metrics(ok, in_tmp):
+    flow = {"flow": {"epe_moving": 0.1, "motion_mean": 0.4}}
+    space = {"test": {"space": {"psnr": 20.0}}}
+    few = of("backward", protocol={"train_views": 16}, **flow)
+    for scene, metrics in {"ball": of("forward", **flow), "cube": few, "cone": of("forward") | space}.items():
+        write_run(in_tmp, scene=scene, metrics=metrics)
+    _, _, *rows, why = ok("report", "kind=compare", "runs=[ball/*,cube/*]").out.splitlines()
+    cells = {row[: row.index("  ")]: row.split()[-2:] for row in rows}
+    assert (cells["all"], cells["moving points' error, % of motion"]) == (["30.00", "30.00"], ["25", "25"])
+    assert (cells["scene"], cells["training views"]) == (["ball", "cube"], ["all", "16"])
+    assert why == "no differences: the runs are of different scenes"
+    last = ok("report", "kind=compare", "runs=[ball/*,cone/*]").out.splitlines()[-1]
+    assert last.endswith("measured in all runs (ball/base-1.0-seed0: all; cone/base-1.0-seed0: space)")
+
+
 def test_a_view_is_drawn_by_every_run_that_has_it(ok, runs, in_tmp):
     for run in runs(one=of("particles"), two=of("forward"), three=of("backward")):
         for name in ("a", "b") if run != "three" else "b":

@@ -129,7 +129,8 @@ def compared(config: DictConfig) -> str:
 
     named = [config.runs] if isinstance(config.runs, str) else list(config.runs or ())
     runs = read_compared([folder for name in named for folder in sorted(glob(str(name))) or [str(name)]])
-    table = compare(runs).plain()
+    compared_runs = compare(runs)
+    table = "\n".join(filter(None, [compared_runs.plain(), compared_runs.caption]))
     if not config.out:
         return table
     drawn = draw_beside(Path(config.out) / "compare.png", runs, 0.5, "test view")

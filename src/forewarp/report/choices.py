@@ -380,7 +380,8 @@ def _value(text: str | None) -> float | str | None:
 
 MEASURED = {"steps": ("steps", 0), "train": ("seconds of training", 0), "frame": ("seconds per image", 3)}
 # Shown where the runs differ in them, as their numbers then tell little of the methods.
-SHOWN_CONDITIONS = {"clock": "clock of the minutes", "threads": "threads", "device": "computed on"}
+SHOWN_CONDITIONS = {"dataset": "dataset", "scene": "scene", "train_views": "training views"}
+SHOWN_CONDITIONS |= {"clock": "clock of the minutes", "threads": "threads", "device": "computed on"}
 SHOWN_CONDITIONS |= {"pictures": "pictures", "measured": "test views", "held_out": "views held out"}
 
 
@@ -388,13 +389,15 @@ def compare(runs: dict[str, Row]) -> Table:
     """Make a table with a row for each measure that all runs have, and a column for each run.
 
     Metrics are those of the test views; for two runs a column with the difference is added, which is empty
-    where they are of different views. Conditions in which the runs differ come last.
+    where they are of different scenes or views. Conditions in which the runs differ come last. The caption
+    says why there are no differences, or no metrics.
 
     Args:
         runs: as of ``read_compared``.
     """
     rows, lines, two = list(runs.values()), [], len(runs) == 2
-    same_views = len({row["measured"] for row in rows}) == 1
+    same_scene = len({(row["dataset"], row["scene"]) for row in rows}) == 1
+    same_views = same_scene and len({row["measured"] for row in rows}) == 1
 
     def add(name: str, values: list, digits: int, with_difference: bool = False) -> None:
         if None not in values:
@@ -409,13 +412,19 @@ def compare(runs: dict[str, Row]) -> Table:
             values = [row["test"].get(kind, {}).get(metric.name) for row in rows]
             add(name, values, metric.digits, same_views)
     shares = [None if row["motion_error"] is None else 100 * row["motion_error"] for row in rows]
-    add("moving points' error, % of motion", shares, 0, True)
+    add("moving points' error, % of motion", shares, 0, same_scene)
     for name, (words, digits) in MEASURED.items():
         add(words, [row[name] or None for row in rows], digits)
     for name, words in SHOWN_CONDITIONS.items():
-        values = ["none named" if row[name] is None else str(row[name]) for row in rows]
+        absent = "all" if name == "train_views" else "none named"
+        values = [absent if row[name] is None else str(row[name]) for row in rows]
         lines += [[words, *values, *[None] * two]] if len(set(values)) > 1 else []
-    return Table(["PSNR (dB) of test views", *runs, *["difference"] * two], lines)
+    told = [f"no differences: the runs are of different {'test views' if same_scene else 'scenes'}"]
+    told = told if two and not same_views else []
+    if not set.intersection(*(set(row["test"]) for row in rows)):
+        kinds = (f"{name}: {', '.join(row['test']) or 'none'}" for name, row in runs.items())
+        told.append(f"no metrics: no kind of test view was measured in all runs ({'; '.join(kinds)})")
+    return Table(["PSNR (dB) of test views", *runs, *["difference"] * two], lines, "\n".join(told))
 
 
 def read_compared(folders: Sequence[str | Path]) -> dict[str, Row]:
