@@ -248,6 +248,29 @@ def test_a_scene_with_one_kind_of_view_is_measured_by_it(tmp_path):
     assert "nhr, 512x384 and 1024x768, background white" in protocols
 
 
+def test_a_column_that_names_no_kind_of_view_has_its_kind_in_the_protocol(tmp_path):
+    both = {"space": {"psnr": 20.0}, "canonical": {"psnr": 21.0}}
+    few = {"measured": "2 of 20 test views, evenly spread"}
+    paper_run(tmp_path / "2", "toy", made=True, protocol=few, **both)
+    paper_run(tmp_path / "all", "toy", made=True, time={"psnr": 22.0}, **both)
+    paper_run(tmp_path, "lift", dataset="lego_complete", made=True, **both)  # whose columns name theirs
+    write_paper(tmp_path, tmp_path / "out")
+    text = re.sub(" +", " ", (tmp_path / "out" / "paper.md").read_text())
+    assert f"| {OURS} | 22.00 |" in text
+    assert f"| {OURS}, 2 test views | 20.00 |" in text
+    of_kinds = re.findall(r"\* protocol \d: (\w+),.* scores of test views (.*)", text)
+    assert of_kinds == [("dnerf", "between training times"), ("dnerf", "at training times")]
+
+
+def test_runs_of_no_table_are_said_to_be_left_out(tmp_path, capsys):
+    for seed in (0, 1):
+        paper_run(tmp_path, "toy", seed=seed, dataset="mine")
+    write_paper(tmp_path, tmp_path / "out")
+    line = "mine, 2 runs: not in any table of the paper; use kind=compare or kind=accuracy_time"
+    assert capsys.readouterr().out == f"{line}\n"
+    assert f"* {line}\n" in (tmp_path / "out" / "paper.md").read_text().split("## Left out")[1]
+
+
 def test_counterparts_never_meet_printed_numbers(tmp_path):
     paper_run(tmp_path, "vehicle", made=True, psnr=28.0)
     paper_run(tmp_path, "lift", dataset="lego_complete", protocol={"synthetic": True})  # however it is read

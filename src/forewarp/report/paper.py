@@ -21,7 +21,7 @@ from forewarp.metrics.gain import Estimate, pooled_deviation
 from forewarp.metrics.registry import metric_of
 from forewarp.report import figures
 from forewarp.report.choices import every_run
-from forewarp.report.results import COUNTERPART, Row, Runs, portable, read_runs
+from forewarp.report.results import COUNTERPART, KINDS, Row, Runs, portable, read_runs
 from forewarp.report.tables import Cell, Column, Difference, Section, Table, rendered
 
 PAPER = Path(__file__).with_name("paper.yaml")  # the printed numbers
@@ -42,7 +42,7 @@ ORDERS = ("holds", "within noise", "reversed", "one seed")
 class Group(NamedTuple):
     """Columns that are a mean over ``scenes`` of a dataset.
 
-    ``ability`` is the kind of test view; None: all, or ``time`` if a scene has several kinds.
+    ``ability`` is the kind of test view; None: that of a run's own ``ability``, which its protocol names.
     """
 
     name: str
@@ -345,11 +345,21 @@ def write_paper(folder: Path, out: Path, published: Path = PAPER, curves: Path |
         published: file of the printed numbers.
         curves: folder of the pictures drawn by ``kind=accuracy_time``, shown too.
     """
-    runs, left_out = _read(folder)
+    paper = read_paper(published).values()
+    runs, left_out = _read(folder, paper)
+    elsewhere = [
+        f"{dataset or 'no dataset'}, {len(found)} run{'s' * (len(found) > 1)}: "
+        "not in any table of the paper; use kind=compare or kind=accuracy_time"
+        for dataset, found in Runs(run | {"of": dataset_of(run)} for run in runs).by("of").items()
+        if dataset not in {group.dataset for table in paper for group in table.groups}
+    ]
+    for line in elsewhere:
+        print(line)
+    left_out += elsewhere
     real, made = runs.where(counterpart=False), runs.where(counterpart=True)
     shown_runs = {
         table: [Runs(run for row in measured(table, kind) for run in row) for kind in (real, made)]
-        for table in read_paper(published).values()
+        for table in paper
     }
     used = Runs(run for kinds in shown_runs.values() for kind in kinds for run in kind)
     numbers, tables, files = numbered(used), [], []
@@ -376,9 +386,16 @@ def write_paper(folder: Path, out: Path, published: Path = PAPER, curves: Path |
     return [*(out / f"paper.{kind}" for kind in ("md", "html", "tex")), *files, *own]
 
 
-def _read(folder: Path) -> tuple[Runs, list[str]]:
-    """Read the measured runs, of runs with the same table entry the newest; and a line for each other run."""
+def _read(folder: Path, tables: Iterable[PaperTable]) -> tuple[Runs, list[str]]:
+    """Read the measured runs, of runs with the same table entry the newest; and a line for each other run.
+
+    A protocol names the kind of test view that is shown where columns of ``tables`` name none.
+    """
     runs, left_out = read_runs(folder)
+    open_kind = {group.dataset for table in tables for group in table.groups if group.ability is None}
+    for run in runs:
+        if dataset_of(run) in open_kind and run["ability"] != "all":
+            run["protocol"] += f", scores of test views {KINDS.get(run['ability'], run['ability'])}"
     runs, older = runs.newest("dataset", "scene", "seed", *ROW)
     return runs, left_out + [f"{row['folder']}: another run of the same is newer" for row in older]
 
@@ -463,9 +480,10 @@ def write_ablation(folder: Path, out: Path, published: Path = PAPER) -> list[Pat
     Raises:
         ValueError: if no run is of an ablation.
     """
-    runs, left_out = _read(folder)
+    paper = read_paper(published).values()
+    runs, left_out = _read(folder, paper)
     # Tables that take the method apart; a table scene by scene repeats another.
-    tables = [table for table in read_paper(published).values() if not table.means and len(table.parts) > 1]
+    tables = [table for table in paper if not table.means and len(table.parts) > 1]
     known = {row.variant for table in tables for row in table.parts}
     runs = Runs(run for run in runs if run["ablation"] in known)
     if not runs:
