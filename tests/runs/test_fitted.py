@@ -295,27 +295,36 @@ def reaching(psnr):
 
 
 def test_a_good_fit_is_not_doubted():
-    assert doubts(run(), reaching(30)) == []
+    assert doubts(run(), reaching(30), "fast") == []
 
 
 @pytest.mark.parametrize(("steps", "said"), [(1, "1 step in"), (49, "49 steps in"), (50, None)])
 def test_a_stage_that_minutes_ended_after_few_steps_is_named(steps, said):
-    lines = doubts(run(steps=steps), reaching(30))
+    lines = doubts(run(steps=steps), reaching(30), "fast")
     named = [f"stage.fine ended after {said} 7.7 s, too few to learn; raise budget.minutes"] if said else []
     assert [line.partition(",")[0] for line in lines] == [line.partition(",")[0] for line in named]
-    assert doubts(run(steps=4, iterations=4), reaching(30)) == []  # as many as were asked for
+    assert doubts(run(steps=4, iterations=4), reaching(30), "fast") == []  # as many as were asked for
 
 
 @pytest.mark.parametrize(
     ("steps", "first"), [(5000, "poses in other axes"), (900, "too little training, 900")]
 )
 def test_low_psnr_names_the_three_likeliest_causes_of_the_format(steps, first):
-    line, *causes = doubts(run(steps, suspects=DNeRFDataModule.suspects), reaching(12.9))
+    line, *causes = doubts(run(steps, suspects=DNeRFDataModule.suspects), reaching(12.9), "fast")
     assert line.startswith("training images are reached to 12.9 dB; one color alone has")
     assert [cause[: len("  likely cause 1")] for cause in causes] == [
         f"  likely cause {i}" for i in (1, 2, 3)
     ]
     assert first in causes[0]
+
+
+@pytest.mark.parametrize("preset", ["demo", "fast", "faithful"])
+def test_advice_fits_the_preset_and_is_given_once(preset):
+    few, _, *causes = doubts(run(steps=9), reaching(12.9), preset)
+    assert ("preset=demo" in few) == (preset != "demo")
+    assert any("in place of preset=demo" in cause for cause in causes) == (preset == "demo")
+    assert sum(cause.endswith("raise the budget") for cause in causes) == 1
+    assert len({cause.rpartition(": ")[2] for cause in causes}) == len(causes)
 
 
 def test_cameras_that_see_nothing_of_the_box_are_counted():
@@ -326,15 +335,15 @@ def test_cameras_that_see_nothing_of_the_box_are_counted():
     assert (blind_frames(SCENE), blind_frames(scene)) == (0, 1)
     small = Box((0.2, 0.2, 0.2), (0.21, 0.21, 0.21))  # between the nine pixels that are asked first
     assert blind_frames(replace(SCENE, box=small)) == 0
-    (line,) = doubts(run(scene=scene), reaching(30))
+    (line,) = doubts(run(scene=scene), reaching(30), "fast")
     assert line.startswith(f"1 of {len(scene.train)} training cameras see nothing of the box")
     in_file = {"normalisation": {"center": [10.0, 0.0, 0.0], "scale": 0.5}}  # remarks and data.box are of it
-    (line,) = doubts(run(scene=replace(scene, protocol=in_file)), reaching(30))
+    (line,) = doubts(run(scene=replace(scene, protocol=in_file)), reaching(30), "fast")
     assert line.endswith("the box (8, -1.6, -1.4) to (12.4, 1.6, 1.4)")
 
 
 def test_images_that_never_came_in_are_counted():
-    (line,) = doubts(run(frames_in_play=2), reaching(30))
+    (line,) = doubts(run(frames_in_play=2), reaching(30), "fast")
     assert line.startswith(
         f"{len(SCENE.train) - 2} of {len(SCENE.train)} training images were never trained on"
     )

@@ -476,10 +476,10 @@ _VIEWS, _PIXELS = 8, 2000  # training images that are looked at, and pixels of e
 
 def doubts_of(config: DictConfig, run: Run, module: DynamicSceneModule) -> list[str]:
     """Return the ``doubts`` about a run; none of one for debugging, which is too short to be good."""
-    return [] if config.get("debug") else doubts(run, module)
+    return [] if config.get("debug") else doubts(run, module, config.preset.name)
 
 
-def doubts(run: Run, module: DynamicSceneModule) -> list[str]:
+def doubts(run: Run, module: DynamicSceneModule, preset: str) -> list[str]:
     """Return lines that say what is wrong with a fitted run, and its likeliest causes; none if all is well.
 
     A stage that minutes ended after few steps, cameras that see nothing of the box, and training images that
@@ -488,6 +488,7 @@ def doubts(run: Run, module: DynamicSceneModule) -> list[str]:
     Cost: some thousand pixels of eight training images are rendered.
     """
     lines, made, scene = [], run.finished(), run.datamodule.scene
+    smaller = "" if preset == "demo" else "take preset=demo, whose steps are smaller, "
     for stage in run.stages:
         name = stage.settings.name
         most = stage.settings.over(len(scene.train)).iterations
@@ -495,8 +496,8 @@ def doubts(run: Run, module: DynamicSceneModule) -> list[str]:
         if steps < min(FEW, most or FEW):
             lines.append(
                 f"stage.{name} ended after {steps} step{'s' * (steps != 1)} in {seconds:.1f} s, too few to "
-                f"learn; raise budget.minutes, give it more of them (stage.{name}.share), take "
-                f"preset=demo, whose steps are smaller, or leave it out (~stage.{name})"
+                f"learn; raise budget.minutes, give it more of them (stage.{name}.share), "
+                f"{smaller}or leave it out (~stage.{name})"
             )
     in_play = max(noted.get("frames_in_play", len(scene.train)) for noted in made.values())
     if in_play < len(scene.train) and run.stages[-1].settings.curriculum.get("most") is None:
@@ -512,10 +513,18 @@ def doubts(run: Run, module: DynamicSceneModule) -> list[str]:
             f"training images are reached to {reached:.1f} dB; one color alone has {one_color:.1f} dB"
         )
         steps = sum(noted["steps"] for noted in made.values())
-        causes = [f"too little training, {steps} steps: raise the budget"] if steps < SHORT else []
-        causes = [*causes, *run.datamodule.suspects][:3]
+        causes = _likeliest(run.datamodule.suspects, steps, preset)[:3]
         lines += [f"  likely cause {number}: {cause}" for number, cause in enumerate(causes, 1)]
     return lines
+
+
+def _likeliest(suspects: Sequence[str], steps: int, preset: str) -> list[str]:
+    """Order the causes of a bad fit; leave out those of another preset, and the same advice given twice."""
+    kept = [cause for cause in suspects if preset == "demo" or "preset=demo" not in cause]
+    if steps >= SHORT:
+        return kept
+    more = "raise the budget"
+    return [f"too little training, {steps} steps: {more}", *(one for one in kept if not one.endswith(more))]
 
 
 def tell(lines: Iterable[str]) -> None:
