@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 
@@ -37,6 +38,18 @@ def test_look_at_is_a_rotation_that_sees_the_target_in_the_middle(center):
     assert depth.item() == pytest.approx(torch.tensor(center).norm().item())
     raised, _ = view.project(torch.tensor([0.0, 0.0, 0.5]))
     assert raised[1] <= 25 + 1e-4  # up is up
+
+
+@pytest.mark.parametrize("form", [np.array, list, torch.tensor], ids=["array", "list", "tensor of integers"])
+def test_arrays_and_lists_are_taken(form):
+    view, points = camera(lens=PHONE), [[0, 0, 0], [0, 1, 1]]
+    for got, expected in zip(view.project(form(points)), view.project(torch.tensor(points).double())):
+        assert got.dtype == torch.float64
+        torch.testing.assert_close(got, expected)
+    u, v = [3, 9], [4, 7]
+    expected = view.directions(torch.tensor(u).double(), torch.tensor(v).double())
+    torch.testing.assert_close(view.directions(form(u), form(v)), expected)
+    assert torch.equal(view.rays(form(u)).directions, view.rays(torch.tensor(u)).directions)
 
 
 @pytest.mark.parametrize("skew", [0.0, 3.0])

@@ -22,6 +22,16 @@ _OUTSIDE, _ON_AXIS = 1e9, 1e-9
 Vector = Tensor | np.ndarray | Sequence[float]
 
 
+def _numbers(given) -> Tensor:
+    """Make a tensor of what a user gives as a tensor, kept if of floats; an array, or a list: float64.
+
+    Raises:
+        TypeError, ValueError: for what is not numbers.
+    """
+    made = given if isinstance(given, Tensor) else torch.from_numpy(np.array(given, np.float64))
+    return made if made.is_floating_point() else made.double()
+
+
 def tensor_of(key: str, given, *shape: int | None) -> Tensor:
     """Make a float64 tensor of what a user gives as a tensor, an array, or a list.
 
@@ -37,7 +47,7 @@ def tensor_of(key: str, given, *shape: int | None) -> Tensor:
     torch.Size([1, 3])
     """
     try:
-        made = given if isinstance(given, Tensor) else torch.from_numpy(np.array(given, np.float64))
+        made = _numbers(given)
     except (TypeError, ValueError):
         made = None
     fits = made is not None and [n if n is None else k for n, k in zip(shape, made.shape)] == [*shape]
@@ -152,7 +162,7 @@ class Camera:
         """Camera centre (3,), float64, world units."""
         return self.camera_to_world[:3, 3]
 
-    def rays(self, pixels: Tensor | None = None, dtype: torch.dtype = torch.float32) -> Rays:
+    def rays(self, pixels: Vector | None = None, dtype: torch.dtype = torch.float32) -> Rays:
         """Make rays through pixel centres.
 
         Args:
@@ -161,26 +171,30 @@ class Camera:
         """
         if pixels is None:
             pixels = torch.arange(self.width * self.height)
+        pixels = torch.as_tensor(pixels)
         u = (pixels % self.width).double() + 0.5
         v = torch.div(pixels, self.width, rounding_mode="floor").double() + 0.5
         directions = self.directions(u, v)
         return Rays(self.center.expand_as(directions).to(dtype), directions.to(dtype), self.near, self.far)
 
-    def directions(self, u: Tensor, v: Tensor) -> Tensor:
+    def directions(self, u: Vector, v: Vector) -> Tensor:
         """Make unit world directions (..., 3) float64 through pixel coordinates ``u v`` (...,), measured from
         the image's top-left corner; lens and skew are undone.
         """
-        y = (v.double() - self.cy) / self.fy
-        x = (u.double() - self.cx - self.skew * y) / self.fx
+        y = (_numbers(v).double() - self.cy) / self.fy
+        x = (_numbers(u).double() - self.cx - self.skew * y) / self.fx
         if self.lens is not None:
             x, y = self.lens.straighten(torch.stack([x, y], -1)).unbind(-1)
         local = torch.stack([x, y, torch.ones_like(x)], -1)
         return torch.nn.functional.normalize(local @ self.camera_to_world[:3, :3].T, dim=-1)
 
-    def project(self, points: Tensor) -> tuple[Tensor, Tensor]:
+    def project(self, points: Vector) -> tuple[Tensor, Tensor]:
         """Project world points (..., 3): pixel coordinates (..., 2) from the top-left corner, and depth along
         the optical axis (...,); a point is visible only if this depth is positive.
+
+        Tensors, arrays and lists will do; a tensor's type is kept.
         """
+        points = _numbers(points)
         pose = self.camera_to_world.to(points)
         local = (points - pose[:3, 3]) @ pose[:3, :3]
         z = local[..., 2]
