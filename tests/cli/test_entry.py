@@ -91,6 +91,10 @@ def test_options_of_ones_own_stand_beside_ours(ok, in_tmp):
     [
         (["data.nothing_like_it=1"], "data.nothing_like_it: expected a key of the configuration, but got"),
         (["budget.minuts=1"], "got none of this name; did you mean budget.minutes?"),
+        (["model=forwrd"], "; did you mean forward?"),
+        (["logger=[tensorboard,wand]"], "; none; tensorboard; wandb; did you mean wandb?"),
+        (["--inf"], "--inf: expected an option of Hydra's, but got none of this name; did you mean --info?"),
+        (["--experiment", "demo"], "--experiment: expected options without dashes; type experiment=demo"),
         (["modle/view_dependence=sh"], "modle/view_dependence: expected a key of the configuration, but got"),
         (["--multirun", "seed=0,1", "model=forward,backward", "budgt=fast"], "did you mean budget?"),
         (

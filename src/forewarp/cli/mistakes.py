@@ -51,7 +51,12 @@ def refuse_dashes(arguments: list[str]) -> None:
         key, _, value = argument.removeprefix("--").partition("=")
         if argument.startswith("--") and key not in OPTIONS:
             follows = arguments[at + 1] if not value and at + 1 < len(arguments) else ""
-            typed = f"{key}={value or ('' if '=' in follows or follows[:1] == '-' else follows) or 'VALUE'}"
+            value = value or ("" if "=" in follows or follows[:1] == "-" else follows)
+            near = [] if value else difflib.get_close_matches(key, OPTIONS, 1, cutoff=0.75)
+            if near:
+                got = f"expected an option of Hydra's, but got none of this name; did you mean --{near[0]}?"
+                raise ValueError(f"{argument}: {got}")
+            typed = f"{key}={value or 'VALUE'}"
             raise ValueError(f"{argument}: expected options without dashes; type {typed}")
 
 
@@ -161,6 +166,10 @@ def one_line(error: BaseException) -> str | None:
             f"{key}: expected one value, but got {value}, which reads as several; add --multirun for a job "
             f"of each, or type a name that has a comma as \"{key}='{value}'\""
         )
+    absent = re.search(r"Could not (?:find|load) '([\w/]+)/([^'/]+)'", str(error))
+    if isinstance(error, HydraException) and absent:
+        said = str(error).split("Config search path")[0]
+        return flat(said) + _nearest_option(*absent.groups(), said)
     if isinstance(error, HydraException | OmegaConfBaseException):
         cause = error.__cause__
         detail = f" ({flat(str(cause))})" if isinstance(cause, OmegaConfBaseException) else ""
@@ -183,6 +192,20 @@ def one_line(error: BaseException) -> str | None:
     if isinstance(error, ImportError):
         return flat(str(error)) + ("" if "forewarp[" in str(error) else _to_install(error))
     return flat(str(error)) if isinstance(error, ValueError) else None
+
+
+def _nearest_option(group: str, word: str, said: str) -> str:
+    """Return the end of a line about an option that there is not: the options, if ``said`` has none of them,
+    and the one of the nearest name.
+    """
+    from forewarp.runs.sections import option_groups
+
+    known = option_groups(configurations(), *installed().values()).get(group, [])
+    listed = (
+        f" Available options in '{group}': {'; '.join(known)}" if known and "Available" not in said else ""
+    )
+    near = difflib.get_close_matches(word, [*known, *re.findall(r"^\t(\S+)$", said, re.M)], 1)
+    return listed + (f"; did you mean {near[0]}?" if near else "")
 
 
 def _to_install(error: ImportError) -> str:
