@@ -49,6 +49,7 @@ def test_info_prints_where_options_come_from(ok, monkeypatch):
     monkeypatch.setattr(logging, "raiseExceptions", True)
     assert f"file://{CONF}" in ok("train", "--info", "searchpath").out
     assert "preset: fast" in ok("train", "--info=defaults-tree", "model=nerf").out
+    assert "preset: demo" in ok("train", "model=nerf", "--info", "defaults-tree", "preset=demo").out
 
 
 def test_the_version_is_forewarps(ok):

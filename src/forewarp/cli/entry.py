@@ -15,7 +15,7 @@ from contextlib import suppress
 from pathlib import Path
 
 import forewarp
-from forewarp.cli.mistakes import flat, one_line, refuse_dashes, unknown_key, with_run_key
+from forewarp.cli.mistakes import flat, one_line, options_last, refuse_dashes, unknown_key, with_run_key
 from forewarp.runs import overrides
 from forewarp.runs.config_files import configurations, installed, project_root
 from forewarp.runs.overrides import as_text, is_sweep, key_of, typed_overrides
@@ -66,7 +66,8 @@ def command(name: str, task: Callable, text: str, *, config: str | None = None) 
 
 
 def _arguments(name: str) -> list[str]:
-    """Return the command line as Hydra takes it: a bare folder has its key, a plan is its overrides.
+    """Return the command line as Hydra takes it: a bare folder has its key, a plan is its overrides, options
+    come last.
 
     ``dataset=NAME`` is ``experiment=NAME`` where scenes are trained on, and a group where they are written.
     """
@@ -80,8 +81,8 @@ def _arguments(name: str) -> list[str]:
     if any(argument.startswith("plan=") for argument in arguments):
         from forewarp.planning.plan_file import with_plan
 
-        return with_plan(name, arguments)
-    return arguments
+        arguments = with_plan(name, arguments)
+    return options_last(arguments)
 
 
 def quiet() -> None:

@@ -16,6 +16,15 @@ OF_METHODS = ("model", "modules", "objective", "preset", "stage")  # what method
 # Hydra's own, which begin with dashes.
 OPTIONS = "help hydra-help version cfg resolve package run multirun shell-completion config-path config-name"
 OPTIONS = (*OPTIONS.split(), "config-dir", "experimental-rerun", "info")
+VALUED = (
+    "cfg",
+    "package",
+    "config-path",
+    "config-name",
+    "config-dir",
+    "experimental-rerun",
+)  # a word follows
+VALUED = {*(f"--{option}" for option in VALUED), "-c", "-p", "-cp", "-cn", "-cd"}
 FOLDERS = {"evaluate": "run", "render": "run", "view": "run", "export": "run", "train": "resume"}
 
 
@@ -58,6 +67,21 @@ def refuse_dashes(arguments: list[str]) -> None:
                 raise ValueError(f"{argument}: {got}")
             typed = f"{key}={value or 'VALUE'}"
             raise ValueError(f"{argument}: expected options without dashes; type {typed}")
+
+
+def options_last(arguments: list[str]) -> list[str]:
+    """Put options that begin with dashes behind the overrides, as Hydra refuses them in between.
+
+    >>> options_last(["model=nerf", "--cfg", "job", "--multirun", "seed=0,1", "--info", "~stage.fine"])
+    ['model=nerf', 'seed=0,1', '~stage.fine', '--cfg', 'job', '--multirun', '--info']
+    """
+    before = ["", *arguments]
+    follows = [
+        before[i] in VALUED or (before[i] in ("--info", "-i") and re.fullmatch("[a-z-]+", one) is not None)
+        for i, one in enumerate(arguments)
+    ]
+    is_option = [is_value or one.startswith("-") for is_value, one in zip(follows, arguments)]
+    return [one for last in (False, True) for one, is_last in zip(arguments, is_option) if is_last == last]
 
 
 def unknown_key(error: Exception, name: str, arguments: list[str]) -> str | None:

@@ -6,7 +6,7 @@ test views. The same command run again skips what is finished and goes on with w
   forewarp-train experiment=demo                     the same in about a minute
   forewarp-train experiment=dnerf data.root=../data/dnerf data.scene=hook budget.minutes=5
 
-What one types most (options such as --multirun or --config-dir=FOLDER come first):
+What one types most (beside options such as --multirun or --config-dir=FOLDER):
   data.root=FOLDER data.scene=NAME    where the scenes are, and which one
   preset=demo|fast|faithful           the method's numbers: small, cheap (the default), as in the paper
   budget.minutes=N                    of training, all stages together; 10 with preset=fast
