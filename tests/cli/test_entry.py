@@ -236,13 +236,13 @@ def test_a_failed_job_of_several_does_not_stop_the_others(forewarp, monkeypatch,
             raise ValueError("seed: expected another")
 
     monkeypatch.setattr("forewarp.cli.train.train", job)
-    done = forewarp("train", "--multirun", "seed=0,1")
+    done = forewarp("train", "seed=0,1", "run=a b/${seed}", "--multirun")
     assert seen == [0, 1]
     assert done.status == 2
     assert done.err.splitlines() == [
         "forewarp-train: error: seed: expected another",
         "forewarp-train: 1 of 2 jobs failed:",
-        "  seed=0",
+        "  forewarp-train seed=0 'run=a b/${seed}'",
     ]
 
 

@@ -18,7 +18,7 @@ import forewarp
 from forewarp.cli.mistakes import flat, one_line, options_last, refuse_dashes, unknown_key, with_run_key
 from forewarp.runs import overrides
 from forewarp.runs.config_files import configurations, installed, project_root
-from forewarp.runs.overrides import as_text, is_sweep, key_of, typed_overrides
+from forewarp.runs.overrides import as_text, command_of_job, is_sweep, key_of
 
 TRACEBACK_VARIABLE = "FOREWARP_TRACEBACK"
 MISTAKE, INTERRUPTED = 2, 130
@@ -145,7 +145,7 @@ def _run(name: str, task: Callable, conf: Path, config_name: str) -> list[int]:
         except Exception as error:
             status = _tell(name, error, config_name)
         with suppress(OSError), open(ended, "a") as file:
-            file.write(f"{status} {' '.join(typed_overrides(of_sweep=True))}\n")
+            file.write(f"{status} {command_of_job(name)}\n")
         return result
 
     # In a file, as jobs may be other processes; those of other machines do not reach it.

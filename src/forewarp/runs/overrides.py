@@ -46,6 +46,28 @@ def command_line(name: str, overrides: Sequence[str]) -> str:
     return shlex.join([f"forewarp-{name}", *overrides])
 
 
+def command_of_job(name: str) -> str:
+    """Return the command that runs this job of a sweep alone, quoted."""
+    typed = [one for one in typed_overrides(of_sweep=True) if not one.startswith(("seeds=", "launcher="))]
+    has_sweep = any(one.startswith("sweeps=") for one in typed)
+    alone = ["hydra.mode=RUN"] if has_sweep else []  # a sweep's file sets the mode
+    return command_line(name, [*typed_folders(), *alone, *map(bare, typed)])
+
+
+def bare(override: str) -> str:
+    r"""Write a path or a name of a scene as it was typed, which Hydra's sweepers escape; others as they are.
+
+    >>> bare(r"run=runs/$\{data.scene\}"), bare(r"data.scene='it\'s'"), bare("seed=1")
+    ('run=runs/${data.scene}', "data.scene=it's", 'seed=1')
+    """
+    from hydra.core.override_parser.overrides_parser import OverridesParser
+
+    if not TEXTS.fullmatch(key_of(override)):
+        return override
+    value = OverridesParser.create().parse_override(override).value()
+    return f"{key_of(override)}={value}" if isinstance(value, str) else override
+
+
 def as_text(arguments: Sequence[str]) -> list[str]:
     """Quote paths and names of scenes so that Hydra keeps them as they were typed: ``2024``, ``VID (1).mp4``.
 
