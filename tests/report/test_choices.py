@@ -182,7 +182,7 @@ def test_of_two_runs_of_a_choice_the_last_one_counts(tmp_path):
     assert rows_of(text, "ball")[0][2] == "31.00"
 
 
-def test_trials_of_a_search_are_listed_the_best_first(tmp_path):
+def test_trials_of_a_search_are_listed_the_best_first(tmp_path, in_tmp):
     runs = tmp_path / "runs"
     for trial, (rate, score) in enumerate([("0.001", 20.0), ("0.01", 25.5), ("3e-3", 22.0), ("0.1", None)]):
         words = f"forewarp-train model=balls preset=demo stage.fine.lr.place={rate} data.root=/home/me/scenes"
@@ -196,16 +196,22 @@ def test_trials_of_a_search_are_listed_the_best_first(tmp_path):
     page, table = write_search(runs, tmp_path / "out")
     text, lines = page.read_text(), table.read_text().splitlines()
     assert "## ball, forward, by psnr of 8 held out views" in text
-    assert rows_of(text, "1") == [["1", "0.01", "25.50", "101", "0.8333"]]
+    assert rows_of(text, "1") == [["1", "0.01", "25.50", "101", "50.0"]]
     assert [line.split(",")[1] for line in lines[1:]] == ["0.01", "0.003", "0.001"]
-    assert lines[0].split(",")[:2] == ["place", "stage.fine.lr.place"]
-    assert "stage.fine.lr.place=0.01 data.root=SCENES" in text
+    assert lines[0].split(",")[:2] == ["rank", "stage.fine.lr.place"]
+    command = f"{words.split(' stage')[0]} stage.fine.lr.place=0.01 data.root=SCENES"
+    assert f"\n{command} run=runs/best/ball/forward-fast-seed0\n" in text
+    assert "unless one is named; replace SCENES by your folder:\n" in text
     assert "t3-1.0-seed0: no score.json; run its command again" in text
 
 
-def test_the_best_of_a_search_for_a_small_score_is_the_smallest(tmp_path):
+def test_the_best_of_a_search_for_a_small_score_is_the_smallest(tmp_path, in_tmp):
     for trial, score in enumerate([0.3, 0.1]):
         words, config = f"forewarp-train preset.rays={trial}", {"score": "lpips_squeeze"}
         run = write_run(tmp_path, f"t{trial}", psnr=None, command=words, config=config)
         (run / "score.json").write_text(json.dumps({"views": "2 views", "scores": {"lpips_squeeze": score}}))
-    assert "preset.rays=1\n```" in write_search(tmp_path, tmp_path / "out")[0].read_text()
+    (in_tmp / "runs/best/ball/forward-fast-seed0").mkdir(parents=True)  # an earlier one
+    text = write_search(tmp_path, tmp_path / "out")[0].read_text()
+    best = "preset.rays=1 model=forward preset=fast run=runs/best/ball/forward-fast-seed0-2\n```"
+    assert best in text  # model and preset were the sweep's
+    assert "is named:\n" in text

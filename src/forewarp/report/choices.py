@@ -7,7 +7,9 @@ from __future__ import annotations
 
 import math
 import re
+import shlex
 from collections.abc import Mapping, Sequence
+from itertools import count
 from pathlib import Path
 from statistics import fmean, mode
 
@@ -17,6 +19,7 @@ from forewarp.metrics.registry import METRICS, metric_of
 from forewarp.report.figures import draw_scene
 from forewarp.report.results import (
     KINDS,
+    PLACES,
     UNREADABLE,
     Point,
     Row,
@@ -339,7 +342,7 @@ def write_search(folder: Path, out: Path) -> list[Path]:
         name += f"-{method}" * (len(runs.where(scene=scene).by("method")) > 1)
         file = out / f"{name}.csv"
         replace_file(file, table.csv())
-        searches.append({"title": title, "table": table, "command": portable(best_first[0]["command"])})
+        searches.append({"title": title, "table": table, **_again(best_first[0])})
         written.append(file)
     text = rendered("search.md.j2", searches=searches, left_out=left_out)
     replace_file(out / "search.md", text)
@@ -353,8 +356,8 @@ def _scored(row: Row) -> list[Row]:
     """Return a run with the score that its search went by; nothing where the run has none."""
     stored, metric = read_json(row["folder"] / "score.json") or {}, row["config"].get("score")
     score = (stored.get("scores") or {}).get(metric)
-    seconds = [float(done["seconds"]) for done in row["stages"].values()]
-    about = {"metric": metric, "score": score, "scored": stored.get("views"), "minutes": sum(seconds) / 60}
+    seconds = sum(float(done["seconds"]) for done in row["stages"].values())
+    about = {"metric": metric, "score": score, "scored": stored.get("views"), "seconds": seconds}
     return [row | about] if isinstance(score, int | float) else []
 
 
@@ -364,11 +367,26 @@ def _trials(trials: Sequence[Row], score: Column) -> Table:
     keys = dict.fromkeys(key for words in typed for key in words if key not in ("run", "forewarp-train"))
     chosen = [key for key in keys if len({words.get(key) for words in typed}) > 1]
     rows = [
-        [number + 1, *(_value(words.get(key)) for key in chosen), row["score"], row["steps"], row["minutes"]]
+        [number + 1, *(_value(words.get(key)) for key in chosen), row["score"], row["steps"], row["seconds"]]
         for number, (row, words) in enumerate(zip(trials, typed))
     ]
-    columns = [Column("place", 0), *(Column(key, None) for key in chosen)]
-    return Table([*columns, score, Column("steps", 0), Column("minutes", None)], rows)
+    columns = [Column("rank", 0), *(Column(key, None) for key in chosen)]
+    return Table([*columns, score, Column("steps", 0), Column("seconds", 1)], rows)
+
+
+def _again(row: Row) -> dict:
+    """Return the command that trains a trial's choices in a folder of their own, and the words in it that
+    stand for folders.
+    """
+    command = portable(row["command"])
+    typed = {word.partition("=")[0] for word in overrides(command)}
+    if "#" not in command and "experiment" not in typed:  # a sweep's file may have chosen these
+        chosen = {"model": row["method"], "preset": row["preset"]}
+        command += "".join(f" {key}={name}" for key, name in chosen.items() if key not in typed)
+    run = f"runs/best/{row['scene']}/{row['method']}-{row['preset']}-seed{row['seed']}"
+    free = next(name for number in count(1) if not Path(name := run + f"-{number}" * (number > 1)).exists())
+    command += " " + shlex.quote(f"run={free}")
+    return {"command": command, "places": [word for word in PLACES.values() if f"={word}" in command]}
 
 
 def _value(text: str | None) -> float | str | None:
