@@ -51,8 +51,12 @@ def test_a_sweep_without_a_name_has_a_folder_and_a_row_of_scores_for_each_job(ok
     scene = ["data=dnerf", "data.root=.", "data.scene=vehicle", "model=forward", "data.rays=64"]
     tiny = ["budget.iterations=4", "stage.coarse.num_voxels=[[0,800]]", "~stage.fine", "logger=csv"]
     words = ["train", "--multirun", *SHORT, *scene, *tiny, "stage.coarse.lr.density=0.1,0.2"]
-    ok(*words)
+    done = ok(*words)
     folders = sorted(Path("runs/vehicle").iterdir())
+    about, *listed = done.out.splitlines()[-3:]
+    assert about == "2 jobs, psnr of held-out or validation views:"
+    assert [line.split()[1] for line in listed] == [str(folder) for folder in folders]
+    assert all(0 < float(line.split()[0]) < 60 for line in listed)
     for folder, rate in zip(folders, ("0.1", "0.2"), strict=True):
         assert re.fullmatch(rf"forward-demo-seed0-coarse-density-{rate}-\w{{10}}", folder.name)
         rows = read_rows(folder / "csv" / "metrics.csv")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import json
 import logging
 import os
 import re
@@ -144,8 +145,11 @@ def _run(name: str, task: Callable, conf: Path, config_name: str) -> list[int]:
             result = task(config)
         except Exception as error:
             status = _tell(name, error, config_name)
+        score = result if isinstance(result, int | float) else None
+        found = [None, None] if status else [str(config.get("run")), config.get("score")]
+        row = [status, command_of_job(name), *found, score]
         with suppress(OSError), open(ended, "a") as file:
-            file.write(f"{status} {command_of_job(name)}\n")
+            file.write(json.dumps(row) + "\n")
         return result
 
     # In a file, as jobs may be other processes; those of other machines do not reach it.
@@ -155,12 +159,25 @@ def _run(name: str, task: Callable, conf: Path, config_name: str) -> list[int]:
             hydra.main(version_base="1.3", config_path=str(conf), config_name=config_name)(job)()
         finally:  # a sweeper may fail, too
             lines = Path(ended).read_text().splitlines() if os.path.exists(ended) else []
-            jobs = [line.split(" ", 1) for line in lines]
-            failed = [words for status, words in jobs if int(status)]
-            if failed and len(jobs) > 1:
-                listed = "".join(f"\n  {words}" for words in failed)
-                print(f"forewarp-{name}: {len(failed)} of {len(jobs)} jobs failed:{listed}", file=sys.stderr)
-    return [int(status) for status, _ in jobs]
+            jobs = [json.loads(line) for line in lines]
+            if len(jobs) > 1:
+                _tell_jobs(name, jobs)
+    return [status for status, *_ in jobs]
+
+
+def _tell_jobs(name: str, jobs: list[tuple[int, str, str | None, str | None, float | None]]) -> None:
+    """Print the folder and the score of each job of a sweep, and the commands of those that failed."""
+    failed = [words for status, words, *_ in jobs if status]
+    done = [job for job in jobs if not job[0]]
+    if name == "train" and done:
+        scored = {metric for *_, metric, score in done if score is not None}
+        about = f", {' and '.join(sorted(scored))} of held-out or validation views" if scored else ""
+        print(f"{len(done)} jobs{about}:")
+        for _, _, run, _, score in done:
+            print(f"  {'' if score is None else f'{score:.4f}':>9}  {run}")
+    if failed:
+        listed = "".join(f"\n  {words}" for words in failed)
+        print(f"forewarp-{name}: {len(failed)} of {len(jobs)} jobs failed:{listed}", file=sys.stderr)
 
 
 def _tell(name: str, error: Exception, config_name: str) -> int:
