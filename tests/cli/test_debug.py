@@ -4,7 +4,9 @@ import json
 import re
 
 import pytest
+from lightning.pytorch.profilers import SimpleProfiler
 
+from forewarp.cli.train import costliest, verdict
 from tests.support.configs import composed, options
 
 MODES = ("fast", "limit", "overfit", "profile")
@@ -41,6 +43,21 @@ def test_what_is_typed_wins():
     assert composed("data.scene=x").debug is None
 
 
+def test_overfitting_is_judged_in_words():
+    assert verdict(28.5, 12.6) == "overfitted: at least 21.0 dB, so the method can learn these images"
+    assert verdict(20.9, 12.6).startswith("not overfitted: less than 21.0 dB; ")
+    assert verdict(30.0, 26.0).startswith("not overfitted: less than 31.0 dB; ")  # a nearly plain image
+
+
+def test_the_costliest_calls_are_those_of_the_table():
+    profiler = SimpleProfiler()
+    profiler.recorded_durations.update({f"call {i}": [float(i), 0.5] for i in range(8)})
+    *lines, _ = costliest(profiler.summary())
+    assert lines[0].split() == ["7.50", "s", "in", "2", "calls", "call", "7"]
+    assert [line.split()[-1] for line in lines] == ["7", "6", "5", "4", "3"]
+    assert costliest("of the advanced profiler: 3 function calls") == []
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("model", FAMILIES)
 def test_every_mode_works_with_every_family(ok, in_tmp, fitted, model):
@@ -65,6 +82,8 @@ def test_every_mode_works_with_every_family(ok, in_tmp, fitted, model):
     assert re.search(
         r"^overfit  psnr \d+\.\d\d of 3 training images after 1[23] steps; ", said["overfit"].out, re.M
     )
+    assert "\nnot overfitted: less than " in said["overfit"].out
+    assert "method.look" in said["profile"].out
     assert re.search(
         r"^profile  runs/debug/vehicle/profile-.*/fine/fit-profile.txt$", said["profile"].out, re.M
     )

@@ -51,9 +51,13 @@ Watch: tensorboard --logdir runs
 
 from __future__ import annotations
 
+import re
 from shlex import quote
 
 from forewarp.cli.entry import command
+
+# Of a profiler's table: action, calls, seconds in all. The row of the total has no mean.
+_ROW = re.compile(r"^\|\s+(\S.*?)\s*\|\s+\d\S*\s*\|\s+(\d+)\s*\|\s+(\d\S*)\s*\|", re.M)
 
 
 def train(config) -> float | None:
@@ -101,9 +105,9 @@ def measure(prepared, module) -> float | None:
         reached, one_color = training_psnr(run, module.to(run.device))
         views, steps = len(run.datamodule.scene.train), sum(done["steps"] for done in run.finished().values())
         about = f"of {views} training images after {steps} steps; one color alone has {one_color:.2f}"
-        print(f"overfit  psnr {reached:.2f} {about}")
+        print(f"overfit  psnr {reached:.2f} {about}", verdict(reached, one_color), sep="\n")
     for file in sorted(run.folder.glob(f"*/*-{PROFILE}.txt")):
-        print(f"profile  {file}")
+        print(f"profile  {file}", *costliest(file.read_text("utf-8")), sep="\n")
     draw_own(run.folder)
     if config.evaluate:
         at = quote(f"run={run.folder}")
@@ -113,6 +117,24 @@ def measure(prepared, module) -> float | None:
         if steps := noted.get("skipped_steps"):
             print(f"{name}: {steps} broken steps skipped; each lies in {run.folder / name / 'broken'}")
     return score
+
+
+def verdict(reached: float, one_color: float) -> str:
+    """Say whether training images seen again and again are learned, from their PSNR, dB, and one color's."""
+    from forewarp.runs.fitted import ABOVE, LOW
+
+    least = max(LOW, one_color + ABOVE)
+    if reached >= least:
+        return f"overfitted: at least {least:.1f} dB, so the method can learn these images"
+    more = "if more steps (budget.iterations) do not help, look for a mistake in the data or the method"
+    return f"not overfitted: less than {least:.1f} dB; {more}"
+
+
+def costliest(table: str, rows: int = 5) -> list[str]:
+    """Return the first rows of a simple profiler's sorted table, as lines; none of another table."""
+    found = _ROW.findall(table)[:rows]
+    lines = [f"  {float(seconds):8.2f} s in {calls:>6} calls  {action}" for action, calls, seconds in found]
+    return [*lines, "  (a row includes those that it calls)"] if lines else []
 
 
 def beginning(run, config) -> str:
