@@ -7,6 +7,7 @@ from importlib.metadata import version
 from types import SimpleNamespace
 
 import pytest
+from lightning.pytorch.loggers import mlflow
 from omegaconf import OmegaConf
 
 from forewarp.cli import entry
@@ -244,6 +245,12 @@ def test_a_failed_job_of_several_does_not_stop_the_others(forewarp, monkeypatch,
         "forewarp-train: 1 of 2 jobs failed:",
         "  forewarp-train seed=0 'run=a b/${seed}'",
     ]
+
+
+def test_the_notice_of_a_new_experiment_is_silenced(caplog):
+    entry.quiet()
+    logging.getLogger(mlflow.__name__).warning("Experiment with name forewarp not found. Creating it.")
+    assert caplog.records == []
 
 
 def test_freed_memory_stays_where_the_c_library_can_be_told(monkeypatch):

@@ -98,6 +98,7 @@ def quiet() -> None:
     os.environ["HYDRA_FULL_ERROR"] = "1"
     logging.disable(logging.INFO)
     logging.getLogger("forewarp.metrics").setLevel(logging.ERROR)  # the table says the same
+    logging.getLogger("lightning.pytorch.loggers.mlflow").setLevel(logging.ERROR)  # of its first run
     if TRACEBACK_VARIABLE not in os.environ:
         warnings.filterwarnings("ignore", module=r"(lightning|torch|tensorboard|numba)(\..*)?$")
         warnings.filterwarnings("ignore", message=".*LeafSpec.*", category=FutureWarning)
