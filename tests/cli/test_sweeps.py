@@ -208,5 +208,6 @@ def test_jobs_that_fail_are_named_and_stop_no_other(launcher, start, tmp_path):
     said = (tmp_path / "log").read_text()
     _, found, failed = said.partition("forewarp-train: 1 of 3 jobs failed:\n")
     assert found
-    assert ["data.scene=lego" in line for line in failed.splitlines()] == [True]
+    listed = [line for line in failed.splitlines() if line.startswith("  forewarp-train ")]
+    assert ["data.scene=lego" in line for line in listed] == [True]  # what Ray passes on may come later
     assert len(measured(tmp_path)) == 1

@@ -176,6 +176,7 @@ def _tell_jobs(name: str, jobs: list[tuple[int, str, str | None, str | None, flo
         print(f"{len(done)} jobs{about}:")
         for _, _, run, _, score in done:
             print(f"  {'' if score is None else f'{score:.4f}':>9}  {run}")
+        sys.stdout.flush()
     if failed:
         listed = "".join(f"\n  {words}" for words in failed)
         print(f"forewarp-{name}: {len(failed)} of {len(jobs)} jobs failed:{listed}", file=sys.stderr)
