@@ -117,6 +117,17 @@ def test_a_run_outlives_a_tracker_that_fails(tmp_path, plain, capsys):
     assert read_rows(tmp_path / "run" / "csv" / "metrics.csv")[-1]["test/all/psnr"] == "30.5"
 
 
+def test_a_row_that_a_killed_run_left_half_written_is_dropped(tmp_path, plain):
+    for step in (1, 2):
+        loggers = RunLoggers({"csv": plain["csv"]}, tmp_path)
+        with loggers:
+            loggers.open(0, step - 1)
+            loggers.log({"train/loss": 1.0, "train/psnr": 20.0}, step)
+        file = tmp_path / "csv" / "metrics.csv"
+        file.write_text(file.read_text() + "1")
+    assert [row["step"] for row in read_rows(file)][:2] == ["1", "2"]
+
+
 def test_what_was_logged_before_the_first_checkpoint_is_not_there_twice(tmp_path, plain):
     for steps in (3, 4):
         loggers = RunLoggers(plain, tmp_path)

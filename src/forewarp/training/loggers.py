@@ -44,7 +44,8 @@ class CsvLogger(CSVLogger):
             file, rows = Path(self.log_dir) / ExperimentWriter.NAME_METRICS_FILE, []
             if file.is_file():
                 with file.open(newline="") as lines:
-                    rows = [row for row in csv.DictReader(lines) if int(row["step"]) <= self.first]
+                    whole = [row for row in csv.DictReader(lines) if None not in row.values()]
+                rows = [row for row in whole if int(row["step"]) <= self.first]  # a killed run tears its last
                 file.unlink()
             # Lightning's writer warns of a folder that holds something, and empties it.
             (Path(self.log_dir) / ExperimentWriter.NAME_HPARAMS_FILE).unlink(missing_ok=True)
@@ -143,7 +144,7 @@ class RunLoggers:
             step = None if step is None else step + self.before
             self._guard(name, lambda: log_metrics(metrics, step))
 
-        logger.finalize = lambda status: logger.save()  # Lightning calls it after each stage
+        logger.finalize = lambda status: self._guard(name, logger.save)  # Lightning's, after each stage
         logger.log_metrics = log_on_the_runs_axis
         return logger
 
@@ -198,14 +199,12 @@ class RunLoggers:
             scores: by name.
             step: steps of the whole run.
         """
-        self.open(0, step)
-        for logger in self._open.values():
+        for name, logger in zip(self.makers, self.open(0, step)):
             if isinstance(logger, TensorBoardLogger):
-                logger.log_hyperparams(dict(self.hyperparameters()), dict(scores), step)
-        others = {name: one for name, one in self._open.items() if not isinstance(one, TensorBoardLogger)}
-        for logger in others.values():
-            logger.log_metrics(dict(scores), step)
-        for name, logger in self._open.items():
+                given = dict(self.hyperparameters()), dict(scores), step
+                self._guard(name, partial(logger.log_hyperparams, *given))
+            else:
+                logger.log_metrics(dict(scores), step)
             self._guard(name, logger.save)
 
     def __enter__(self) -> RunLoggers:
