@@ -324,11 +324,6 @@ class NHRDataModule(_FolderDataModule):
         "frames of the cameras that are not of one moment: compare the images of a number",
     )
 
-    def __init__(self, root: str | Path, scene: str, **options) -> None:
-        if "test_views" in options:  # what runs before 0.3 call it
-            options["test_cameras"] = options.pop("test_views")
-        super().__init__(root, scene, **options)
-
 
 class MulticamDataModule(_FolderDataModule):
     """A rig of fixed cameras, as ``multicam.read_scene`` reads it."""
