@@ -178,12 +178,12 @@ def read_json(path: Path) -> dict | None:
         return None
 
 
-def load_json(path: Path) -> dict:
-    """Read the object of a JSON file.
+def load_json(path: Path, top: type = dict) -> dict | list:
+    """Read the object of a JSON file, or the list where ``top`` is list.
 
     Raises:
         OSError: where it cannot be read.
-        ValueError: in one line, if the file is too large, does not parse or holds no object.
+        ValueError: in one line, if the file is too large, does not parse or holds another thing.
     """
     text = decoded(read_bytes(path), path)
     try:
@@ -192,8 +192,9 @@ def load_json(path: Path) -> dict:
         raise ValueError(f"{path}: line {error.lineno}: expected JSON, but got {error.msg}") from error
     except (ValueError, RecursionError) as error:  # absurd numbers or nesting
         raise ValueError(f"{path}: expected JSON, but got {short(str(error))}") from error
-    if not isinstance(content, dict):
-        raise ValueError(f"{path}: expected a JSON object at the top, but got {type(content).__name__}")
+    if not isinstance(content, top):
+        kind = "object" if top is dict else top.__name__
+        raise ValueError(f"{path}: expected a JSON {kind} at the top, but got {type(content).__name__}")
     return content
 
 

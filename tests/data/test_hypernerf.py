@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 
+from forewarp.data.depth import SensedDepth
 from forewarp.data.files import SceneError
 from forewarp.data.hypernerf import read_camera, read_scene, reduced, write_camera
 from forewarp.data.images import write_image
@@ -23,6 +24,7 @@ from tests.support.written_scenes import (
     RIG_TRUTH,
     SCALE,
     edit,
+    film,
     hand,
     phone,
     real,
@@ -255,3 +257,110 @@ def test_images_that_are_missing_are_left_out_and_jpeg_is_read(tmp_path):
     after = read_scene(tmp_path, "toy", scale=1)
     assert [frame.name for frame in after.train] == [frame.name for frame in before.train[1:]]
     assert f"images are not there and left out ({gone}.png, ..)" in after.protocol["assumed"][0]
+
+
+# A phone that measures depth -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("scale", [1, 2])
+def test_round_trip_of_a_film_with_depth(tmp_path, scale):
+    write_rig(tmp_path / "toy", film(), fps=10.0)
+    scene, middle = read_scene(tmp_path, "toy", scale=scale, depth="depth"), slice(scale // 2, None, scale)
+    for frame, shot in zip(scene.train, [shot for shot in film() if shot.split == "train"], strict=True):
+        depth, trust = frame.load_sensed()
+        rays, axis = frame.camera.rays(dtype=torch.float64), frame.camera.camera_to_world[:3, 2]
+        along = depth.double() * (rays.directions @ axis).reshape(depth.shape)
+        stored, sure = (values[middle, middle] for values in (shot.depth, shot.confidence))
+        np.testing.assert_allclose(along, SCALE * stored, rtol=1e-6)
+        np.testing.assert_allclose(trust, np.where(stored > 0, sure, 0))
+        assert torch.equal(frame.keypoints, torch.tensor(shot.keypoints / (scale, scale, 1)).float())
+    for frame in scene.test:
+        assert (frame.load_sensed, frame.keypoints) == (None, None)
+        assert torch.equal(frame.load_covisible().float().mean(0), torch.arange(12 // scale) < 6 // scale)
+    expected = {"dataset": "iphone", "depth": "depth, of 4 of 4 training frames", "seconds": 0.3}
+    assert expected.items() <= scene.protocol.items()
+    assert read_scene(tmp_path, "toy").train[0].load_sensed is None
+
+
+def test_depths_may_be_millimetres(tmp_path):
+    metres, folder = write_rig(tmp_path / "a", film()), write_rig(tmp_path / "b", film(unit=1000.0))
+    expected, scene = (read_scene(f.parent, f.name, depth="depth") for f in (metres, folder))
+    torch.testing.assert_close(scene.train[1].load_sensed(), expected.train[1].load_sensed())
+    assert "thousandths" in scene.protocol["assumed"][0]
+    write_rig(folder, film(unit=50.0))
+    with pytest.raises(SceneError, match="expected depths between near and far, 1.5 and 7 in the cameras'"):
+        read_scene(tmp_path, "b", depth="depth")
+
+
+def test_splits_take_the_place_of_the_lists(tmp_path):
+    folder = write_rig(tmp_path / "toy", film())
+    (folder / "splits").mkdir()
+    for name, items in (("train", [0, 1]), ("val", [3]), ("train_mono", [2]), ("val_mono", [0, 1])):
+        names = [f"{int(name[:3] == 'val')}_{item:05d}" for item in items]
+        (folder / "splits" / f"{name}.json").write_text(json.dumps({"frame_names": names}))
+    for split, train, test in ((None, ["0_00000", "0_00001"], ["1_00003"]), ("mono", ["0_00002"], None)):
+        scene = read_scene(tmp_path, "toy", split=split)
+        assert [f.name for f in scene.train] == train
+        assert [f.name for f in scene.test] == (test or ["1_00000", "1_00001"])
+    edit(folder / "splits" / "val.json", {"frame_names.0": "none"})
+    with pytest.raises(SceneError, match="val.json: frame_names: expected items of dataset.json, but got"):
+        read_scene(tmp_path, "toy")
+
+
+def test_pixels_of_alpha_0_are_unknown(tmp_path):
+    folder = write_rig(tmp_path / "toy", film())
+    rgba = np.full((4, 6, 4), 255, np.uint8)
+    rgba[0, :3, 3] = 0
+    write_image(folder / "rgb" / "2x" / "0_00001.png", rgba)
+    masks = [frame.load_valid for frame in read_scene(tmp_path, "toy").train]
+    assert [mask is not None for mask in masks] == [False, True, False, False]
+    assert torch.equal(masks[1](), torch.tensor(rgba[..., 3] > 0))
+
+
+BAD = {
+    "depth/2x/0_00001.npy": (np.zeros((4, 6, 2)), "expected depths \\(H, W\\), but got shape \\(4, 6, 2\\)"),
+    "depth/2x/0_00002.npy": (-np.ones((4, 6)), "expected depths >= 0, but got -1; write 0 where"),
+    "confidence/2x/0_00001.npy": (
+        np.ones((4, 5)),
+        "expected 6 x 4 confidences as 0_00001.npy, but got 5 x 4",
+    ),
+    "confidence/2x/0_00002.npy": (np.full((4, 6), 1.5), "expected confidences from 0 to 1, or levels"),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_bad_depth_is_refused_in_a_line(tmp_path, name):
+    array, message = BAD[name]
+    folder = write_rig(tmp_path / "toy", film())
+    np.save(folder / name, array)
+    with pytest.raises(SceneError, match=f"{name.split('/')[-1]}: {message}"):
+        [frame.load_sensed() for frame in read_scene(tmp_path, "toy", depth="depth").train]
+
+
+def test_absent_depth_is_refused_in_a_line(tmp_path):
+    folder = write_rig(tmp_path / "toy", rig())
+    with pytest.raises(
+        SceneError, match="2x: expected a folder of depths, but got none; set data.depth=null"
+    ):
+        read_scene(tmp_path, "toy", depth="depth")
+    (folder / "keypoint" / "2x" / "train").mkdir(parents=True)
+    (folder / "keypoint" / "2x" / "train" / "left1_000000.json").write_text("[[1, 2]]")
+    with pytest.raises(SceneError, match=r"000000.json: expected a list of \[x, y, seen\], but got"):
+        read_scene(tmp_path, "toy")
+
+
+def test_depth_of_another_size_is_taken_at_the_nearest_pixel(tmp_path):
+    camera = phone(0, (12, 8))
+    values = np.arange(1, 7, dtype=np.uint8).reshape(2, 3)
+    np.save(tmp_path / "a.npy", values)
+    np.save(tmp_path / "trust.npy", np.array([[0, 1, 2], [2, 2, 0]], np.uint8))
+    depth, trust = SensedDepth(tmp_path / "a.npy", camera, 2.0, tmp_path / "trust.npy")()
+    along = camera.rays().directions @ camera.camera_to_world[:3, 2].float()
+    expected = torch.tensor(2.0 * values).repeat_interleave(4, 0).repeat_interleave(4, 1)
+    torch.testing.assert_close((depth * along.reshape(8, 12)).double(), expected, rtol=1e-5, atol=0)
+    assert trust[::4, ::4].tolist() == [[0, 0.5, 1], [1, 1, 0]]
+    np.save(tmp_path / "a.npy", np.ones((4, 4)))
+    with pytest.raises(
+        SceneError, match="expected depths of the proportions of its image, 12 x 8 pixels, but"
+    ):
+        SensedDepth(tmp_path / "a.npy", camera, 1.0)()

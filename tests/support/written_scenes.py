@@ -138,6 +138,21 @@ def hand(count=11):
         yield hypernerf.RigShot(f"{t + 1:06d}", t, 0, "train", camera, noise(rng, camera))
 
 
+def film(times=4, size=(12, 8), unit=1.0):
+    """A phone that measures depth, with a hole and a doubtful pixel, and one beside it, that is held out."""
+    rng = np.random.default_rng(2)
+    for t in range(times):
+        camera, beside = phone(2 * t, size), phone(2 * t + 1, size)
+        depth, trust = unit * rng.uniform(3.5, 4.5, size[::-1]), np.ones(size[::-1])
+        depth[:2, :2], trust[4:6, 4:6] = 0, 0.5
+        points = np.array([[2.0 * t, 4.0, 1], [6, 2, t % 2]])
+        yield hypernerf.RigShot(
+            f"0_{t:05d}", t, 0, "train", camera, noise(rng, camera), depth, trust, keypoints=points
+        )
+        seen = np.arange(size[0])[None] < np.full(size[::-1], size[0] // 2)
+        yield hypernerf.RigShot(f"1_{t:05d}", t, 1, "val", beside, noise(rng, beside), covisible=seen)
+
+
 def write_rig(folder: Path, shots=None, **changes) -> Path:
     """A rig of five times; what it stores differs from the normalised world."""
     options = {"center": CENTER, "scale": SCALE, "near": NEAR, "far": FAR} | changes

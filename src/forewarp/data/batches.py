@@ -208,15 +208,19 @@ class Targets(Sequence[Target]):
     def __getitem__(self, index: int) -> Target:
         frame = self.frames[index]
         rgba, depth = pixels_of(frame), frame.load_depth() if frame.load_depth else None
-        valid, moving = (load and load() for load in (frame.load_valid, frame.load_moving))
+        masks = frame.load_valid, frame.load_moving, frame.load_covisible
+        valid, moving, covisible = (load and load() for load in masks)
         if self.factor > 1:
             rgba = reduced(rgba, self.factor)
             depth = None if depth is None else reduced_depth(depth, self.factor)
-            valid = None if valid is None else block_means(valid.float(), self.factor) == 1
+            valid, covisible = (
+                None if mask is None else block_means(mask.float(), self.factor) == 1
+                for mask in (valid, covisible)
+            )
             moving = None if moving is None else block_means(moving.float(), self.factor) >= 0.5
         foreground = None if depth is None else depth > 0
         if self.has_alpha:
             foreground = rgba[..., 3] > 127  # at least half covered
         place = index % len(self.frames) if self.trained else None
         rgb = composited(rgba, self.background)
-        return Target(frame, rgb, self.background, foreground, depth, place, valid, moving)
+        return Target(frame, rgb, self.background, foreground, depth, place, valid, moving, covisible)

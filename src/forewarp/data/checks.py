@@ -36,6 +36,7 @@ _REMEDIES = {
         "set data.box=null, or mend the file's aabb",
         "set data.box=null data.near=null data.far=null, or mend the file's aabb, near and far",
     ),
+    "iphone": ("mend {key} in scene.json", *("mend scene.json, or set data.box=null",) * 2),
     "": ("set data.{key}", "set data.box=null", "set data.box=null data.near=null data.far=null"),
 }
 

@@ -113,14 +113,14 @@ def read_bytes(path: Path, most: int = MOST_BYTES) -> bytes:
         return stream.read()
 
 
-def read_json(path: Path) -> dict:
-    """Read the object of a JSON file.
+def read_json(path: Path, top: type = dict) -> dict | list:
+    """Read the object of a JSON file, or the list where ``top`` is list.
 
     Raises:
-        SceneError: where the file is missing, too large, does not parse (with the line) or holds no object.
+        SceneError: where the file is missing, too large, does not parse (with the line) or holds other data.
     """
     with opened(path):
-        return load_json(path)
+        return load_json(path, top)
 
 
 def number(value: object, where: str, low: float = -inf, high: float = inf) -> float:

@@ -5,6 +5,12 @@
 The optional ``points.npy`` (N, 3) holds points that never move, the optional ``trajectories.npz`` true
 trajectories (see ``data.arrays``). Scene coordinates are ``(X - center) * scale`` of those in the files.
 
+Beyond these, dycheck's captures may have ``depth/<s>x/<id>.npy`` of the unscaled world, along the optical
+axis, 0 where there is none, and ``confidence/`` likewise; ``covisible/<s>x/<split>/<id>.png``, bright where
+training images show a pixel of a held-out image too; ``keypoint/<s>x/<split>/<id>.json``, rows of x, y and
+whether it is seen; ``splits/<split>.json``, whose ``frame_names`` take the place of ``dataset.json``'s lists;
+and ``extra.json``, of which ``fps`` is read. An alpha of 0 says that a pixel is unknown.
+
 A camera file's ``orientation`` is world-to-camera with OpenCV's axes, ``position`` the camera's centre in the
 unscaled world; all else is in pixels of the full-size image. Old files say ``tangential`` for
 ``tangential_distortion``.
@@ -32,9 +38,18 @@ from forewarp.data.cameras import (
     frustum_box,
     pose_of,
 )
+from forewarp.data.depth import SensedDepth, unit_of
 from forewarp.data.directions import by_translation, opposite, other_readings, transposed
 from forewarp.data.files import Entry, inside, mismatch, number, read_json, remove, scene_folder, whole
-from forewarp.data.images import StoredImage, check_pixels, inspect_image, turned_by_exif, write_image
+from forewarp.data.images import (
+    MovingMask,
+    StoredImage,
+    StoredMask,
+    check_pixels,
+    inspect_image,
+    turned_by_exif,
+    write_image,
+)
 from forewarp.data.transforms import check_pinhole, check_times, numbers_in, with_images, with_suffix
 from forewarp.files import write_json
 from forewarp.scene.camera import Camera, Lens
@@ -42,7 +57,7 @@ from forewarp.scene.frame import Frame, Scene, Truth, middle_of
 
 _SCALES, _ASPECTS = (1e-6, 1e6), (1e-2, 1e2)
 _MOST_PIXELS, _MOST_PIXELS_OFF, _MOST_BENT = 1e5, 1e7, 1e3  # beyond them a camera file is wrong
-_MOST_MOMENTS = 1e9
+_MOST_MOMENTS, _RATES = 1e9, (1e-3, 1e5)
 _EVERY = 4  # the published interpolation protocol: train on every fourth, test midway between
 
 
@@ -57,6 +72,9 @@ _READINGS = {  # what else may be in a camera file, with what mends it
 class RigShot:
     """An item to write: ``camera`` of the full-size image in the unscaled world, ``rgb`` uint8 (H, W, 3),
     ``split`` train, val or "" for neither. Items of one ``time_id`` were taken at the same moment.
+
+    Where it has them: ``depth`` (H, W) along the optical axis, unscaled world, 0 where there is none, and its
+    ``confidence`` (H, W) in [0, 1]; ``covisible`` bool (H, W); ``keypoints`` (J, 3), pixels x, y and 0 or 1.
     """
 
     name: str
@@ -65,9 +83,21 @@ class RigShot:
     split: str
     camera: Camera
     rgb: Tensor | np.ndarray
+    depth: np.ndarray | None = None
+    confidence: np.ndarray | None = None
+    covisible: np.ndarray | None = None
+    keypoints: np.ndarray | None = None
 
 
-def read_scene(root: str | Path, scene: str, *, scale: int = 2, box: Sequence[float] | None = None) -> Scene:
+def read_scene(
+    root: str | Path,
+    scene: str,
+    *,
+    scale: int = 2,
+    box: Sequence[float] | None = None,
+    depth: str | None = None,
+    split: str | None = None,
+) -> Scene:
     """Read ``root/scene``; pixels are decoded when a frame is first loaded.
 
     With ``val_ids`` these are tested and ``train_ids`` trained on (split "vrig"). Without, every fourth item
@@ -77,6 +107,9 @@ def read_scene(root: str | Path, scene: str, *, scale: int = 2, box: Sequence[fl
     Args:
         scale: which of the stored sizes, sides ``scale`` times smaller than the full-size image.
         box: x0 y0 z0 x1 y1 z1 in normalised units; None takes the bounds of all training rays.
+        depth: folder of the training images' depth, ``depth`` of dycheck's captures; None: none is used.
+        split: ``mono``, ``intl`` or another ending of names in ``splits/``: ``train_mono``, ``val_mono``;
+            None: ``train`` and ``val``, where these are there, else the lists of ``dataset.json``.
 
     Raises:
         SceneError: for every file or value that is missing or wrong, with file and key.
@@ -94,6 +127,12 @@ def read_scene(root: str | Path, scene: str, *, scale: int = 2, box: Sequence[fl
         raise mismatch(f"{world.file}: near, far", "near < far", f"{near:g} and {far:g}")
     normalised = Normalisation(center, size, near, far)
     how, ids, train_ids, test_ids = _read_split(folder / "dataset.json")
+    of_train, of_test = (part if split is None else f"{part}_{split}" for part in ("train", "val"))
+    if split is not None or (folder / "splits" / "train.json").is_file():
+        train_ids, test_ids = (
+            _listed(folder / "splits" / f"{part}.json", ids) for part in (of_train, of_test)
+        )
+        how = f"splits/{of_train}.json and {of_test}.json"
     times, camera_ids, numbers, assumed = _read_items(folder / "metadata.json", ids)
     where = f"{folder / 'dataset.json'}: ids"
     paths = {item: with_suffix(inside(images, item, where)) for item in ids}
@@ -106,6 +145,11 @@ def read_scene(root: str | Path, scene: str, *, scale: int = 2, box: Sequence[fl
 
     stored: dict[str, Tensor] = {}  # poses in the unscaled world
     turned: list[Path] = []
+    depths, unit = {}, size
+    if depth is not None:
+        depths = _depths(inside(folder, depth, "data.depth") / f"{scale}x", train_ids)
+        unit, told = unit_of([*depths.values()], near / size, far / size)
+        unit, assumed = unit * size, assumed + told
 
     def frame(item: str) -> Frame:
         path = paths[item]
@@ -113,10 +157,24 @@ def read_scene(root: str | Path, scene: str, *, scale: int = 2, box: Sequence[fl
         stored[item] = camera.camera_to_world
         camera = reduced(normalised.camera(camera), scale)
         size = camera.width, camera.height
-        if inspect_image(path, size, f", the camera's image_size / {scale}").is_turned:
+        header, options = inspect_image(path, size, f", the camera's image_size / {scale}"), {}
+        if header.is_turned:
             turned.append(path)
-        load = StoredImage(path, size, opaque=True)  # of dycheck's an alpha of 0 says "no depth here"
-        return Frame(item, times[item], camera, load, camera_id=camera_ids[item])
+        if header.has_alpha:
+            options["load_valid"] = StoredMask(path, size, of_alpha=True)
+        if item in depths:
+            trust = folder / "confidence" / f"{scale}x" / f"{item}.npy"
+            trust = trust if trust.is_file() else None
+            options["load_sensed"] = SensedDepth(depths[item], camera, unit, trust)
+        mask = folder / "covisible" / f"{scale}x" / of_test / f"{item}.png"
+        if mask.is_file():
+            inspect_image(mask, size, f" as {path.name}")
+            options["load_covisible"] = MovingMask(mask, size)
+        points = folder / "keypoint" / f"{scale}x" / of_train / f"{item}.json"
+        if points.is_file():
+            options["keypoints"] = _read_keypoints(points)
+        load = StoredImage(path, size, opaque=True)
+        return Frame(item, times[item], camera, load, camera_id=camera_ids[item], **options)
 
     train, test = (tuple(map(frame, items)) for items in (train_ids, test_ids))
     splits = {"train": train_ids, "val": test_ids}
@@ -125,14 +183,25 @@ def read_scene(root: str | Path, scene: str, *, scale: int = 2, box: Sequence[fl
     if len({*numbers.values()}) == 1:
         assumed.append(f"{folder / 'metadata.json'}: all items are of time {numbers[ids[0]]}: one moment")
     canonical, points = middle_of(f.time for f in train), folder / "points.npy"
+    counts = {len(f.keypoints) for f in train if f.keypoints is not None}
+    if len(counts) > 1:
+        where = folder / "keypoint" / f"{scale}x" / of_train
+        raise mismatch(where, "as many keypoints in each file", f"{min(counts)} and {max(counts)}")
     protocol = {
-        "dataset": "hypernerf",
+        "dataset": "hypernerf" if depth is None else "iphone",
         "scale": scale,
         "split": how,
         "resolution": [train[0].camera.width, train[0].camera.height],
         "train_frames": len(train),
         "test_frames": len(test),
     }
+    if (folder / "extra.json").is_file():
+        extra = Entry(folder / "extra.json", read_json(folder / "extra.json"))
+        protocol["seconds"] = (max(numbers.values()) - min(numbers.values())) / extra.number("fps", *_RATES)
+    if depth is not None:
+        protocol["depth"] = f"{depth}, of {len(depths)} of {len(train)} training frames"
+    if any(f.load_valid for f in train):
+        protocol["masks"] = "ignore: pixels of alpha 0 are not trained or measured on"
     assumed += turned_by_exif(turned, images)
     if ways := other_readings(list(stored.values()), _READINGS):
         line = "cameras do not look at one thing, as all of them do if"
@@ -158,6 +227,7 @@ def write_scene(
     points: np.ndarray | Tensor | None = None,
     scales: Sequence[int] = (1, 2),
     trajectories: Truth | None = None,
+    fps: float | None = None,
 ) -> None:
     """Write a capture that ``read_scene`` reads; each file appears whole or not at all.
 
@@ -171,10 +241,12 @@ def write_scene(
         points: (N, 3) that never move, unscaled world.
         scales: scales of the images to write; every side is a multiple of all of them.
         trajectories: unscaled world, the canonical time first.
+        fps: moments a second, where known.
     """
     folder, metadata = Path(folder), {}
     remove(folder, "dataset.json", "metadata.json", "scene.json", "points.npy", "trajectories.npz")
-    remove(folder, "camera/*.json", "rgb/*x/*.png")
+    remove(folder, "camera/*.json", "rgb/*x/*.png", "extra.json", "splits/*.json", "depth/*x/*.npy")
+    remove(folder, "confidence/*x/*.npy", "covisible/*x/*/*.png", "keypoint/*x/*/*.json")
     parts: dict[str, list[str]] = {"train": [], "val": [], "": []}
     for shot in shots:
         if shot.name in metadata or shot.split not in parts:
@@ -190,6 +262,8 @@ def write_scene(
     world |= {"near": float(near), "far": float(far)}
     dataset = {"count": len(metadata), "num_exemplars": len(parts["train"]), "ids": list(metadata)}
     dataset |= {"train_ids": parts["train"], "val_ids": parts["val"]}
+    if fps is not None:
+        write_json(folder / "extra.json", {"fps": float(fps), "factor": max(scales)})
     for name, content in (("scene", world), ("metadata", metadata), ("dataset", dataset)):
         write_json(folder / f"{name}.json", content)
 
@@ -282,6 +356,40 @@ def _read_split(path: Path) -> tuple[str, list[str], list[str], list[str]]:
     return "interpolation", ids, [ids[i] for i in chosen], [ids[i + _EVERY // 2] for i in chosen[:-1]]
 
 
+def _listed(path: Path, ids: list[str]) -> list[str]:
+    """Read the ``frame_names`` of a split; SceneError where they are no different items of ``ids``."""
+    names = read_json(path).get("frame_names")
+    if (
+        not isinstance(names, list)
+        or not all(isinstance(n, str) for n in names)
+        or len({*names}) < len(names)
+    ):
+        raise mismatch(f"{path}: frame_names", "a list of different names", short(names))
+    if unknown := [name for name in names if name not in {*ids}]:
+        raise mismatch(f"{path}: frame_names", "items of dataset.json", short(unknown[0]), "list it in ids")
+    return names
+
+
+def _depths(folder: Path, items: Sequence[str]) -> dict[str, Path]:
+    """Find the files of training items' depth in a folder; SceneError where there is none at all."""
+    if not folder.is_dir():
+        raise mismatch(folder, "a folder of depths", "none", "set data.depth=null to do without")
+    paths = {item: inside(folder, f"{item}.npy", "ids") for item in items}
+    there = {item: path for item, path in paths.items() if path.is_file()}
+    if not there:
+        expected, advice = f"depths named as images, {items[0]}.npy", "set data.depth=null to do without"
+        raise mismatch(folder, expected, "none of them", advice)
+    return there
+
+
+def _read_keypoints(path: Path) -> Tensor:
+    """Read keypoints (J, 3): x, y and whether they are seen; SceneError for other rows."""
+    rows = read_json(path, list)
+    if not all(isinstance(row, list) and len(row) == 3 for row in rows):
+        raise mismatch(path, "a list of [x, y, seen]", short(rows))
+    return torch.tensor([[number(value, str(path)) for value in row] for row in rows]).reshape(-1, 3)
+
+
 def _read_items(
     path: Path, ids: list[str]
 ) -> tuple[dict[str, float], dict[str, int | None], dict[str, int], list[str]]:
@@ -344,4 +452,17 @@ def _write_shot(folder: Path, shot: RigShot, scales: Sequence[int]) -> None:
     for s in scales:
         means = rgb.reshape(height // s, s, width // s, s, 3).mean((1, 3))
         write_image(folder / "rgb" / f"{s}x" / f"{shot.name}.png", np.rint(means).astype(np.uint8))
+        middles = slice(s // 2, None, s), slice(s // 2, None, s)  # depths of two things have no mean
+        for kind, values in (("depth", shot.depth), ("confidence", shot.confidence)):
+            if values is not None:
+                write_array(
+                    folder / kind / f"{s}x" / f"{shot.name}.npy", np.asarray(values)[middles][..., None]
+                )
+        if shot.covisible is not None:
+            mask = np.uint8(255) * np.asarray(shot.covisible, bool)[middles]
+            write_image(folder / "covisible" / f"{s}x" / (shot.split or "val") / f"{shot.name}.png", mask)
+        if shot.keypoints is not None:
+            rows = np.asarray(shot.keypoints, float) / (s, s, 1)
+            place = folder / "keypoint" / f"{s}x" / (shot.split or "train")
+            write_json(place / f"{shot.name}.json", rows.tolist())
     write_camera(folder / "camera" / f"{shot.name}.json", shot.camera)

@@ -27,6 +27,10 @@ class Frame:
     ``load_valid()``, if not None, gives (H, W) bool: the pixels, at least one, that count in training and in
     metrics.
     ``load_moving()``, if not None, gives (H, W) bool: the pixels of what moves, which are scored apart.
+    ``load_sensed()``, if not None, gives (2, H, W) float32: ray depth as a sensor measured it, world units, 0
+    where it did not, and its confidence in [0, 1]: evidence to train on, not the truth.
+    ``load_covisible()``, if not None, gives (H, W) bool: the pixels of what training images show too.
+    ``keypoints`` (J, 3): pixel x and y of J points that several frames show, and 1 where it is seen, else 0.
     """
 
     name: str
@@ -38,6 +42,9 @@ class Frame:
     camera_id: int | None = None
     load_valid: Callable[[], Tensor] | None = None
     load_moving: Callable[[], Tensor] | None = None
+    load_sensed: Callable[[], Tensor] | None = None
+    load_covisible: Callable[[], Tensor] | None = None
+    keypoints: Tensor | None = None
 
     __repr__ = brief
 

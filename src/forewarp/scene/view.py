@@ -191,7 +191,8 @@ class Target:
 
     If known: ``foreground`` (H, W) bool, ``depth`` (H, W) exact ray depth in world units (0 on the
     background), ``index`` among the training frames, ``valid`` (H, W) bool, the pixels that count,
-    ``moving`` (H, W) bool, those of what moves.
+    ``moving`` (H, W) bool, those of what moves, ``covisible`` (H, W) bool, those of what training images show
+    too.
     """
 
     frame: Frame
@@ -202,6 +203,7 @@ class Target:
     index: int | None = None
     valid: Tensor | None = None
     moving: Tensor | None = None
+    covisible: Tensor | None = None
 
     __repr__ = brief
 
@@ -217,6 +219,6 @@ class Target:
 
     def to(self, device) -> Target:
         """Move the tensors to another device."""
-        names = ("rgb", "background", "foreground", "depth", "valid", "moving")
+        names = ("rgb", "background", "foreground", "depth", "valid", "moving", "covisible")
         known = {name: getattr(self, name) for name in names if getattr(self, name) is not None}
         return replace(self, **{name: tensor.to(device) for name, tensor in known.items()})

@@ -1,0 +1,128 @@
+"""Depth that a sensor measured, beside a scene's images."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from forewarp.data.arrays import load_numpy
+from forewarp.data.files import mismatch
+from forewarp.data.images import CACHE, by, read_gray16, read_image
+from forewarp.scene.camera import Camera, Lens
+from forewarp.scene.frame import spread
+
+SUFFIXES = (".npy", ".png")
+MILLIMETRES = 1e-3
+_LEVELS = 2  # of ARKit's confidence: 0 low, 1 medium, 2 high
+_LOOKED_AT = 4  # files that tell the unit
+_BEYOND = 2.0  # share of near and far within which the median of depths of the right unit lies
+
+
+class SensedDepth:
+    """Depth of an image and how far to trust it, (2, H, W) float32: the distance along a pixel's ray in world
+    units, 0 where there is none, and its confidence in [0, 1]. Read at its first use and kept while there is
+    room; it is read-only.
+
+    Args:
+        path: .npy (H', W') or (H', W', 1), or grey PNG of 16 bits, of depths along the optical axis; what is
+            0 or not finite is a hole. Its proportions are the image's, of which each pixel takes the nearest.
+        camera: of the image.
+        scale: world units for one unit of the file.
+        confidence: .npy or grey PNG as large: from 0 to 1, or ARKit's levels 0, 1, 2; None: 1 everywhere.
+    """
+
+    def __init__(self, path: Path, camera: Camera, scale: float, confidence: Path | None = None) -> None:
+        self.path, self.camera, self.scale, self.confidence = path, camera, scale, confidence
+
+    def __call__(self) -> Tensor:
+        """Give both; SceneError where a file holds anything else."""
+        return CACHE.get(self, self._decode)
+
+    def _decode(self) -> Tensor:
+        depth = read_depth(self.path)
+        trust = np.ones_like(depth) if self.confidence is None else _read_confidence(self.confidence)
+        if trust.shape != depth.shape:
+            expected = f"{by(depth.shape[::-1])} confidences as {self.path.name}"
+            raise mismatch(self.confidence, expected, by(trust.shape[::-1]))
+        size, camera = (self.camera.height, self.camera.width), self.camera
+        if abs(depth.shape[0] * size[1] - depth.shape[1] * size[0]) > max(*depth.shape, *size):
+            expected = f"depths of the proportions of its image, {by(size[::-1])} pixels"
+            raise mismatch(self.path, expected, by(depth.shape[::-1]))
+        planes = torch.from_numpy(np.stack([depth * self.scale, trust * (depth > 0)]).astype(np.float32))
+        planes = torch.nn.functional.interpolate(planes[None], size, mode="nearest-exact")[0]
+        inner = camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy, camera.skew
+        planes[0] /= _cosines(*inner, camera.lens)
+        return planes
+
+
+def read_depth(path: Path) -> np.ndarray:
+    """Read depths (H, W) float64 of a file as ``SensedDepth`` takes them, holes as 0.
+
+    Raises:
+        SceneError: for another shape, and for a depth below 0.
+    """
+    depth = read_gray16(path) if path.suffix == ".png" else load_numpy(path)
+    shape = getattr(depth, "shape", ())
+    if len(shape) == 3 and shape[2] == 1:
+        depth, shape = depth[..., 0], shape[:2]
+    if len(shape) != 2 or 0 in shape or depth.dtype.kind not in "iuf":
+        raise mismatch(path, "depths (H, W)", f"shape {shape}" if hasattr(depth, "shape") else "arrays")
+    depth = np.array(depth, np.float64)
+    depth[~np.isfinite(depth)] = 0
+    if (depth < 0).any():
+        raise mismatch(path, "depths >= 0", f"{depth.min():g}", "write 0 where there is none")
+    return depth
+
+
+def _read_confidence(path: Path) -> np.ndarray:
+    """Read confidences (H, W) in [0, 1]: levels and bytes are whole numbers."""
+    values = read_image(path)[..., 0].numpy() if path.suffix == ".png" else load_numpy(path)
+    values = values[..., 0] if getattr(values, "ndim", 0) == 3 else values
+    if getattr(values, "ndim", 0) != 2 or values.dtype.kind not in "iuf" or not values.size:
+        raise mismatch(path, "confidences (H, W)", f"shape {getattr(values, 'shape', ())}")
+    most = 1.0 if values.dtype.kind == "f" else float(_LEVELS if values.max() <= _LEVELS else 255)
+    if not (values.min() >= 0 and values.max() <= most):
+        got = f"values from {values.min():g} to {values.max():g}"
+        raise mismatch(path, "confidences from 0 to 1, or levels 0, 1, 2", got)
+    return np.asarray(values, np.float64) / most
+
+
+@lru_cache(maxsize=8)
+def _cosines(width: int, height: int, *inner: float | Lens | None) -> Tensor:
+    """Return the depth along the optical axis (H, W) of what is at distance 1; once for all images of a
+    camera, as undoing a lens takes long.
+    """
+    fx, fy, cx, cy, skew, lens = inner
+    camera = Camera(width, height, fx, fy, cx, cy, torch.eye(4, dtype=torch.float64), 0.0, 1.0, skew, lens)
+    return camera.rays(dtype=torch.float64).directions[:, 2].reshape(height, width).float()
+
+
+def unit_of(paths: Sequence[Path], near: float, far: float) -> tuple[float, list[str]]:
+    """Tell the unit of depths by which one puts their median between near and far, and in a line if it is not
+    that of the file's world but a thousandth.
+
+    Args:
+        paths: of the depths, of which some are read.
+        near, far: in units of the file's world.
+
+    Raises:
+        SceneError: where neither does, or all are holes.
+    """
+    depths = [read_depth(paths[i]) for i in spread(len(paths), _LOOKED_AT)]
+    there = np.concatenate([depth[depth > 0] for depth in depths])
+    if not there.size:
+        raise mismatch(paths[0].parent, "depths above 0", "holes alone")
+    median = float(np.median(there))
+    for unit in (1.0, MILLIMETRES):
+        if near / _BEYOND <= unit * median <= _BEYOND * far:
+            line = (
+                f"{paths[0].parent}: depths are taken for thousandths of the cameras' unit, as near and far"
+            )
+            return unit, [] if unit == 1 else [f"{line} say"]
+    expected = f"depths between near and far, {near:.4g} and {far:.4g} in the cameras' unit, or thousandths"
+    raise mismatch(paths[0].parent, expected, f"{median:.4g} in the median", "write them in that unit")
