@@ -14,7 +14,6 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import fmean
-from unittest.mock import patch
 
 import numpy as np
 import torch
@@ -35,24 +34,20 @@ from forewarp.runs.fitted import opened
 from forewarp.scene.box import Box
 from forewarp.scene.camera import Camera
 from forewarp.scene.frame import Frame, Scene
+from forewarp.synth.movers import moving_faces, near_movers, specimen
 from forewarp.synth.raycast import Posed, camera_rays, light_points, surface_points
-from forewarp.synth.shapes import Material, Part, box, sphere
-from forewarp.synth.vehicle import rotation, shift
-from forewarp.synth.world import INK, LACQUER, ROOM_HIGH, ROOM_LOW, STONES, SUBJECTS, TILES, Specimen, World
+from forewarp.synth.world import ROOM_HIGH, ROOM_LOW, World
 from tests.support.captures import Walk, cameras_of, pose_errors
 from tests.support.films import write_film
 
 TRUTH, MASKS = "truth", "moving"
 # Metres and seconds. The camera is 2.5 m from what moves; a metre there is 220 pixels.
 WALK = Walk("film", True, (-112.0, -72.0), 2.5, 14.0, (0.0, 0.05, 0.62), 44.0)
-BESIDE, RADIUS, GRAVITY = 0.3, 0.15, 9.81
-BOUNCE = 0.36  # height of the ball's bounces
+BESIDE = 0.3
 GAIN, DRIFT = 0.13, 7.0  # of the exposure: share, period
 SHUTTER = 0.5  # share of the time between frames
 # Instants averaged into a frame where something moves; where nothing does, every third of them.
 INSTANTS, EVERY = 9, 3
-_PAD = 4  # pixels around what moves
-MOVERS = ("box", "ball")
 
 
 @dataclass(frozen=True)
@@ -73,43 +68,6 @@ class Form:
 PHONE = Form()
 
 
-def _joints(seconds: float) -> dict[str, np.ndarray]:
-    """Place what moves at a time: the box slides to and fro at 0.15 to 1.05 Hz, the ball falls freely."""
-    phase = 2 * np.pi * (0.6 * seconds - 0.45 * 5 / (2 * np.pi) * np.cos(2 * np.pi * seconds / 5))
-    slid = shift((0.5 * np.sin(phase), 0.22, 0.5 + 0.001))
-    turned = rotation(0.5 * seconds + 0.8 * np.sin(2 * np.pi * 0.23 * seconds), 0, 1)
-    fall = 2 * np.sqrt(2 * BOUNCE / GRAVITY)
-    share = seconds / fall % 1
-    x, y = 0.4 * np.sin(2 * np.pi * 0.17 * seconds + 1), -0.42 + 0.08 * np.sin(2 * np.pi * 0.11 * seconds)
-    thrown = shift((x, y, ROOM_LOW[2] + RADIUS + 4 * BOUNCE * share * (1 - share)))
-    rolled = rotation(-x / RADIUS, 2, 0) @ rotation(0.9 * seconds, 1, 2)
-    return {"ground": np.eye(4), "box": slid @ turned, "ball": thrown @ rolled}
-
-
-def _parts() -> list[Part]:
-    """Make what moves, and before the walls a bench, a crate, a shelf and a pillar."""
-    floor = ROOM_LOW[2]
-
-    def still(name: str, low, high, colors, scale: float) -> Part:
-        return Part(name, "ground", *box(low, high), Material("mosaic", colors, scale))
-
-    return [
-        Part("box", "box", *box((-0.16, -0.12, 0.0), (0.16, 0.12, 0.27)), Material("mosaic", TILES, 0.06)),
-        Part("ball", "ball", *sphere(RADIUS), Material("mosaic", LACQUER, 0.06), smooth=True),
-        still("bench", (-0.85, 0.0, floor), (0.85, 0.5, 0.5), STONES, 0.09),
-        still("crate", (-1.3, 0.7, floor), (-0.75, 1.2, 0.8), LACQUER, 0.11),
-        still("shelf", (-0.5, 1.45, 1.25), (0.9, 1.75, 1.35), (*TILES[:4], INK), 0.07),
-        still("pillar", (0.95, 0.9, floor), (1.2, 1.15, 2.0), (*STONES[:4], INK), 0.08),
-    ]
-
-
-def world_of(form: Form) -> World:
-    """Make the room and what moves in it, whose times in [0, 1] are those of a film."""
-    moving = Specimen(lambda time: _joints(form.seconds * time), _parts)
-    with patch.dict(SUBJECTS, film=moving):
-        return World("film", has_room=True)
-
-
 class Filming:
     """Take frames of a film, and views beside it.
 
@@ -118,8 +76,8 @@ class Filming:
     """
 
     def __init__(self, form: Form) -> None:
-        self.form, self.world = form, world_of(form)
-        self.moves = np.array([part.name in MOVERS for part in self.world.parts])[self.world.part_of_face]
+        self.form, self.world = form, World(specimen(form.seconds), has_room=True)
+        self.moves = moving_faces(self.world)
         still, steps = np.eye(4), (np.arange(INSTANTS) + 0.5) / INSTANTS
         level = replace(self.cameras([0.0])[0], camera_to_world=torch.from_numpy(still))
         # The R1 sequence covers each pixel evenly.
@@ -150,7 +108,7 @@ class Filming:
         cameras = self.cameras(times)
         if aside is not None:
             cameras = [replace(c, camera_to_world=c.camera_to_world @ aside) for c in cameras]
-        near = self._near_movers(times, cameras)
+        near = np.flatnonzero(near_movers(self.world, times, cameras))
         everywhere = np.arange(height * width)
         total, seen, covered = (np.zeros((len(everywhere), *more)) for more in ((3,), (), ()))
         for i, (instant, camera) in enumerate(zip(times, cameras)):
@@ -165,24 +123,6 @@ class Filming:
         color = self.gain(time) * total / seen.clip(1)[:, None]
         pixels = np.rint(255 * color.clip(0, 1)).astype(np.uint8)
         return pixels.reshape(height, width, 3), (covered > 0.5 * INSTANTS).reshape(height, width)
-
-    def _near_movers(self, times, cameras) -> np.ndarray:
-        """Find the pixels in rectangles around each thing that moves, while the shutter is open."""
-        ends: dict[str, list] = {name: [] for name in MOVERS}
-        for time, camera in zip(times, cameras):
-            maps = self.world.subject.joints(time)
-            for part in self.world.parts[: len(MOVERS)]:
-                placed = part.vertices @ maps[part.joint][:3, :3].T + maps[part.joint][:3, 3]
-                ends[part.name].append(camera.project(torch.from_numpy(placed))[0].numpy())
-        (width, height), near = self.form.size, np.zeros(self.form.size[::-1], bool)
-        for places in map(np.concatenate, ends.values()):
-            (left, top), (right, bottom) = places.min(0) - _PAD, places.max(0) + _PAD
-            columns, rows = (
-                slice(*np.clip((a, b), 0, most).astype(int))
-                for a, b, most in ((left, right, width), (top, bottom, height))
-            )
-            near[rows, columns] = True
-        return np.flatnonzero(near)
 
 
 def name_of(number: int) -> str:

@@ -102,6 +102,7 @@ def test_bad_arguments_leave_nothing(refused, in_tmp):
         ("lego_complete", ["size=8", "frames=2", "motions=[lift]", "test_views=[1,1,1]"], "lift"),
         ("hypernerf", ["size=16", "frames=3"], "dataset.json"),
         ("nhr", ["size=24", "frames=2", "points=20"], "CamPose.inf"),
+        ("multicam", ["size=16", "frames=2", "cameras=2"], "truth.json"),
     ],
 )
 def test_every_dataset_is_written_whole_and_replaced_when_told(

@@ -105,7 +105,7 @@ def test_the_number_of_processes_does_not_matter(monkeypatch, world, kind):
 @pytest.mark.parametrize(("samples", "expected"), [(1, 1), (6, 1), (9, 2), (100, 3)])
 def test_processes_are_for_much_work_and_never_more_than_processors(monkeypatch, world, samples, expected):
     monkeypatch.setattr(raycast, "cores", lambda: 3)
-    monkeypatch.setattr(raycast, "_SAMPLES_A_PROCESS", 4 * 144)
+    monkeypatch.setattr(raycast, "SAMPLES_A_PROCESS", 4 * 144)
     monkeypatch.setattr(raycast, "render", lambda *_: 1)
     monkeypatch.setattr(
         raycast, "_rendered_by_processes", lambda views, samples, shadow_rays, workers: [workers]

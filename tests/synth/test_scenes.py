@@ -21,6 +21,7 @@ TINY = {
     "lego_complete": {"size": 8, "motions": ["lift", "drive"], **FEW},
     "hypernerf": {"size": 16, "frames": 3},
     "nhr": {"size": 24, "frames": 2, "points": 30},
+    "multicam": {"size": 16, "frames": 2, "cameras": 2},
 }
 BAD = [
     ("dnerf", {"size": 7}, "size: expected a whole number of at least 8, but got 7"),
@@ -38,6 +39,9 @@ BAD = [
     ("hypernerf", {"frames": 4}, "frames: expected an odd number, one in the middle, but got 4; set frames"),
     ("hypernerf", {"motion": "still"}, "motion: expected one of lift, lift_tilt, drive, but got 'still'"),
     ("nhr", {"size": 100}, "size: expected a multiple of 24 of at least 24, but got 100; set size"),
+    ("multicam", {"size": 65}, "size: expected a multiple of 2 of at least 16, but got 65; set size"),
+    ("multicam", {"cameras": 1}, "cameras: expected a whole number of at least 2, but got 1; set cameras"),
+    ("multicam", {"synchronised": "yes"}, "synchronised: expected true or false, but got 'yes'"),
 ]
 
 

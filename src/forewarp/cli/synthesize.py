@@ -1,11 +1,12 @@
 """
 forewarp-synthesize writes a procedural brick vehicle whose arm lifts, whose rubber band stretches and whose
-ball bounces, with exact point trajectories, in the format of one of four datasets. The files depend on the
-keys alone, not on the number of processes.
+ball bounces, with exact point trajectories, in the format of one of four datasets; or films two movers in a
+room, with true poses, times and masks. The files depend on the keys alone, not on the number of processes.
 
   forewarp-synthesize                                data/vehicle in the project
   forewarp-synthesize folder=scenes/large size=400 frames=100
   forewarp-synthesize dataset=lego_complete          three scenes at full size: minutes, 0.9 GB
+  forewarp-synthesize dataset=multicam folder=rig    then forewarp-capture videos=rig
 
 What one types most:
   dataset=dnerf          one scene, a random camera for each time, exact depth
@@ -13,6 +14,8 @@ What one types most:
                          paper's data, not the authors' files
           hypernerf      two phones on a rig in a textured room: lens distortion, no alpha, static points
           nhr            20 cameras of two image sizes around it: masks, point clouds
+          multicam       two movers in a room: videos by cameras=12 that begin apart, with a clap;
+                         truth/ for experiment=video_with_poses; synchronised=true for experiment=multicam
   folder=FOLDER          the scene's own folder
   size=N frames=N seed=N pixels, times, random cameras
   motion=lift|lift_tilt|drive      how it moves; motions=[...] for lego_complete

@@ -269,10 +269,11 @@ def smaller_video(path: Path, most: int) -> tuple[bytes, str]:
     return b"", "left out"
 
 
-def write_video(path: Path, images: Iterable[Tensor], *, fps: float) -> Path:
+def write_video(path: Path, images: Iterable[Tensor], *, fps: float, sound: Path | None = None) -> Path:
     """Write images (H, W, 3) in [0, 1], taken one by one, in the format that the suffix names.
 
     ``.mp4`` and ``.gif`` are files; ``.png`` makes a folder of images, named like the file without suffix.
+    ``sound`` is a WAV file, of which an ``.mp4`` gets an AAC track.
 
     Returns:
         the file or the folder.
@@ -288,7 +289,7 @@ def write_video(path: Path, images: Iterable[Tensor], *, fps: float) -> Path:
         if path.suffix == ".gif":
             iio.imwrite(beside, list(frames), extension=".gif", duration=1000 / fps, loop=0)
         else:
-            _write_mp4(beside, frames, fps)
+            _write_mp4(beside, frames, fps, sound)
     return path
 
 
@@ -299,7 +300,7 @@ def keep_first(folder: Path, count: int) -> None:
             path.unlink()
 
 
-def _write_mp4(path: Path, frames: Iterable[np.ndarray], fps: float) -> None:
+def _write_mp4(path: Path, frames: Iterable[np.ndarray], fps: float, sound: Path | None) -> None:
     # The codec takes even sides only.
     frames = (np.pad(f, ((0, f.shape[0] % 2), (0, f.shape[1] % 2), (0, 0)), mode="edge") for f in frames)
     first = next(frames)
@@ -309,6 +310,8 @@ def _write_mp4(path: Path, frames: Iterable[np.ndarray], fps: float) -> None:
         "-colorspace",
         "smpte170m",
     ]  # as ffmpeg converts; else players take HD for BT.709
+    if sound is not None:
+        options |= {"audio_path": str(sound), "audio_codec": "aac"}
     writer = imageio_ffmpeg.write_frames(str(path), first.shape[1::-1], **options)
     writer.send(None)
     try:

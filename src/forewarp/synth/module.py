@@ -20,13 +20,14 @@ from forewarp.data.module import (
 )
 from forewarp.progress import Counted
 from forewarp.scene.frame import Scene
-from forewarp.synth import scenes
+from forewarp.synth import recordings, scenes
 
 WRITERS = {
     "dnerf": scenes.synthesize,
     "lego_complete": scenes.synthesize_lego_complete,
     "hypernerf": scenes.synthesize_hypernerf,
     "nhr": scenes.synthesize_nhr,
+    "multicam": recordings.synthesize_multicam,
 }
 
 

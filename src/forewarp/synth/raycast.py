@@ -8,7 +8,7 @@ from __future__ import annotations
 import pickle
 import signal
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from functools import lru_cache
@@ -31,7 +31,7 @@ LIFT_OFF = 2e-4
 # Candidates per wanted surface point: about half of the surface is never visible.
 _SPARE = 4
 # A process takes seconds to start and casts about two million samples a second.
-_SAMPLES_A_PROCESS = 4e7
+SAMPLES_A_PROCESS = 4e7
 # Images per process waiting to be written: enough that no process idles, few enough for the memory.
 _AHEAD = 3
 
@@ -147,32 +147,47 @@ def render(
     **Cost** H * W * samples_per_pixel * (1 + shadow_rays) rays at most.
     """
     posed, shape = _posed(world, time), (camera.height, camera.width)
-    count = camera.height * camera.width
-    total, hit, depth = np.zeros((count, 3)), np.zeros(count), np.zeros(count, dtype=np.float32)
+    rgb, alpha = shaded(posed, camera, samples_per_pixel, shadow_rays)
+    rgba = np.rint(255 * np.concatenate([rgb, alpha[:, None]], -1)).astype(np.uint8)
+    center, depth = posed.first_hits(*camera_rays(camera)), np.zeros(len(rgb), np.float32)
+    depth[center.ray] = center.distance
+    return rgba.reshape(*shape, 4), depth.reshape(shape)
+
+
+def shaded(
+    posed: Posed, camera: Camera, samples_per_pixel: int, shadow_rays: int, pixels: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Shade pixels: colours (n, 3) in [0, 1], straight, and the shares (n,) of their samples that hit.
+
+    Args:
+        samples_per_pixel, shadow_rays: see ``render``.
+        pixels: (n,) numbers, row by row; None: all. The colour of one does not depend on the others.
+    """
+    count = camera.height * camera.width if pixels is None else len(pixels)
+    total, hit = np.zeros((count, 3)), np.zeros(count)
     lights = light_points(samples_per_pixel * shadow_rays, posed.light)
     for i in range(samples_per_pixel):
         # The R1 sequence covers the pixel evenly with any number of samples; a single sample is the centre.
         offset = ((i + 0.5) / samples_per_pixel, (0.5 + i * 0.6180339887498949) % 1.0)
-        origins, directions = camera_rays(camera, offset)
+        origins, directions = camera_rays(camera, offset, pixels)
         hits = posed.first_hits(origins, directions)
         total[hits.ray] += posed.color(hits, lights[i::samples_per_pixel], directions)
         hit[hits.ray] += 1
-    rgb = total / np.maximum(hit, 1)[:, None]
-    rgba = np.rint(255 * np.concatenate([rgb, hit[:, None] / samples_per_pixel], -1)).astype(np.uint8)
-    center = posed.first_hits(*camera_rays(camera))
-    depth[center.ray] = center.distance
-    return rgba.reshape(*shape, 4), depth.reshape(shape)
+    return total / np.maximum(hit, 1)[:, None], hit / samples_per_pixel
 
 
 _posed = lru_cache(1)(Posed)  # once for all cameras of one time
 
 
-def camera_rays(camera: Camera, offset: tuple[float, float] = (0.5, 0.5)) -> tuple[np.ndarray, np.ndarray]:
-    """Make origins and unit directions (H*W, 3) float64 through one spot of every pixel, row by row."""
-    columns = torch.arange(camera.width, dtype=torch.float64) + offset[0]
-    rows = torch.arange(camera.height, dtype=torch.float64) + offset[1]
-    v, u = torch.meshgrid(rows, columns, indexing="ij")
-    directions = camera.directions(u.flatten(), v.flatten()).numpy()
+def camera_rays(
+    camera: Camera, offset: tuple[float, float] = (0.5, 0.5), pixels: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Make origins and unit directions (n, 3) float64 through one spot of pixels, numbered row by row; None:
+    of all.
+    """
+    pixels = np.arange(camera.height * camera.width) if pixels is None else pixels
+    v, u = (torch.from_numpy(place + at) for place, at in zip(divmod(pixels, camera.width), offset[::-1]))
+    directions = camera.directions(u, v).numpy()
     return np.broadcast_to(camera.center.double().numpy(), directions.shape), directions
 
 
@@ -250,7 +265,7 @@ def render_all(
         shadow_rays: shadow rays of each ray.
     """
     pixels = sum(camera.width * camera.height for _, _, camera in views)
-    workers = workers or max(1, min(cores(), int(pixels * samples / _SAMPLES_A_PROCESS)))
+    workers = workers or max(1, min(cores(), int(pixels * samples / SAMPLES_A_PROCESS)))
     if workers == 1:
         images = (render(*view, samples, shadow_rays) for view in views)
     else:
@@ -262,12 +277,26 @@ def render_all(
 
 
 def _rendered_by_processes(views, samples: int, shadow_rays: int, workers: int):
+    jobs = ((w.motion, w.has_room, time, camera, samples, shadow_rays) for w, time, camera in views)
+    return by_processes(_render, jobs, workers)
+
+
+def by_processes(function: Callable, jobs: Iterable[tuple], workers: int) -> Iterator:
+    """Yield ``function(*job)`` of each job, in order; with one worker in this process, else in others.
+
+    Args:
+        function: of a module, so that other processes find it.
+        jobs: taken one by one, a few ahead of what is yielded.
+        workers: processes.
+    """
+    if workers == 1:
+        yield from (function(*job) for job in jobs)
+        return
     pool, waiting = ProcessPoolExecutor(workers, get_context("spawn"), _begin), deque()
     try:
-        for world, time, camera in views:
+        for job in jobs:
             # Pickled here: an executor would send each tensor through a file in shared memory.
-            job = pickle.dumps((time, camera, samples, shadow_rays))
-            waiting.append(pool.submit(_render, world.motion, world.has_room, job))
+            waiting.append(pool.submit(_call, function, pickle.dumps(job)))
             if len(waiting) > _AHEAD * workers:
                 yield waiting.popleft().result()
         yield from (future.result() for future in waiting)
@@ -284,8 +313,12 @@ def _begin() -> None:
 _world = lru_cache(4)(World)  # of a process
 
 
-def _render(motion: str, has_room: bool, job: bytes) -> tuple[np.ndarray, np.ndarray]:
-    return render(_world(motion, has_room), *pickle.loads(job))
+def _render(motion: str, has_room: bool, *view) -> tuple[np.ndarray, np.ndarray]:
+    return render(_world(motion, has_room), *view)
+
+
+def _call(function: Callable, job: bytes):
+    return function(*pickle.loads(job))
 
 
 def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:

@@ -147,17 +147,23 @@ def _wings() -> list[Part]:
     return parts
 
 
-def room() -> list[Part]:
-    """Make six thin closed boxes, which cast no shadow, as the light is outside."""
-    (x0, y0, z0), (x1, y1, z1), t = ROOM_LOW, ROOM_HIGH, 0.1
-    return [
-        _tiled("floor", "ground", (x0 - t, y0 - t, z0 - t), (x1 + t, y1 + t, z0), FLOOR, 0.30, False),
-        _tiled("ceiling", "ground", (x0 - t, y0 - t, z1), (x1 + t, y1 + t, z1 + t), CEILING, 0.50, False),
-        _tiled("left", "ground", (x0 - t, y0, z0), (x0, y1, z1), LEFT, 0.38, False),
-        _tiled("right", "ground", (x1, y0, z0), (x1 + t, y1, z1), RIGHT, 0.38, False),
-        _tiled("front", "ground", (x0 - t, y0 - t, z0), (x1 + t, y0, z1), BACK, 0.34, False),
-        _tiled("back", "ground", (x0 - t, y1, z0), (x1 + t, y1 + t, z1), BACK, 0.34, False),
-    ]
+def room(low=ROOM_LOW, high=ROOM_HIGH, fineness: float = 1.0) -> list[Part]:
+    """Make six thin closed boxes, which cast no shadow, as the light is outside.
+
+    Args:
+        low, high: corners (3,) of the space within.
+        fineness: how many times smaller the tiles are.
+    """
+    (x0, y0, z0), (x1, y1, z1), t = low, high, 0.1
+    sides = (
+        ("floor", (x0 - t, y0 - t, z0 - t), (x1 + t, y1 + t, z0), FLOOR, 0.30),
+        ("ceiling", (x0 - t, y0 - t, z1), (x1 + t, y1 + t, z1 + t), CEILING, 0.50),
+        ("left", (x0 - t, y0, z0), (x0, y1, z1), LEFT, 0.38),
+        ("right", (x1, y0, z0), (x1 + t, y1, z1), RIGHT, 0.38),
+        ("front", (x0 - t, y0 - t, z0), (x1 + t, y0, z1), BACK, 0.34),
+        ("back", (x0 - t, y1, z0), (x1 + t, y1 + t, z1), BACK, 0.34),
+    )
+    return [_tiled(name, "ground", *box, scale / fineness, casts=False) for name, *box, scale in sides]
 
 
 SPECIMENS = {
@@ -181,12 +187,13 @@ class World:
     (V, 3) are coordinates in each part's rest frame, from which colours are computed.
 
     Args:
-        motion: a name in ``SUBJECTS``.
+        motion: a name in ``SUBJECTS``, or a subject, which ``render_all`` renders in this process only.
         has_room: put a static room around the subject.
     """
 
-    def __init__(self, motion: str = "lift_tilt", has_room: bool = False):
-        self.motion, self.has_room, self.subject = motion, has_room, SUBJECTS[motion]
+    def __init__(self, motion: str | Specimen = "lift_tilt", has_room: bool = False):
+        self.motion, self.has_room = motion, has_room
+        self.subject = motion if isinstance(motion, Specimen) else SUBJECTS[motion]
         self.parts = self.subject.parts() + self.subject.extra() + (room() if has_room else [])
         self.rest, self.faces = joined([(p.vertices, p.faces) for p in self.parts])
         self.part_of_face = np.repeat(np.arange(len(self.parts)), [len(p.faces) for p in self.parts])

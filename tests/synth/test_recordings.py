@@ -1,0 +1,132 @@
+"""A rig's films show what the truth says: frames, times, masks and sound."""
+
+import json
+import subprocess
+
+import imageio_ffmpeg
+import numpy as np
+import pytest
+import torch
+
+from forewarp.data import multicam, posed_video
+from forewarp.data.video import stamps_of
+from forewarp.synth.movers import placed_movers
+from forewarp.synth.raycast import render
+from forewarp.synth.recordings import HERTZ, LATEST, SHADOW_RAYS, hall, rig, synthesize_multicam
+from tests.support.films import read_film
+
+SIZE, FRAMES, CAMERAS = 64, 6, 3
+LUMA = (0.299, 0.587, 0.114)
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """The folder of a tiny rig's films."""
+    seen = []
+    folder = tmp_path_factory.mktemp("rig") / "films"
+    arguments = {"cameras": CAMERAS, "frames": FRAMES, "size": SIZE, "samples_per_pixel": 2, "workers": 1}
+    synthesize_multicam(folder, **arguments, progress=lambda *counts: seen.append(counts))
+    assert seen == [(done, CAMERAS * FRAMES) for done in range(1, CAMERAS * FRAMES + 1)]
+    return folder
+
+
+@pytest.fixture(scope="module")
+def truth(made):
+    """What its file says."""
+    return json.loads((made / "truth.json").read_text())
+
+
+@pytest.fixture(scope="module")
+def scene(made):
+    """Its true scene."""
+    return posed_video.read_scene(made, "truth", normalise=False, test_cameras=["cam01"])
+
+
+def heard(path):
+    """The sound of a video, float64 at ``HERTZ``."""
+    call = [imageio_ffmpeg.get_ffmpeg_exe(), "-v", "error", "-i", str(path), "-f", "s16le", "-ar", str(HERTZ)]
+    raw = subprocess.run([*call, "-"], capture_output=True, check=True).stdout
+    return np.frombuffer(raw, "<i2") / 32768
+
+
+def test_films_hold_the_true_frames_at_the_true_rates(made, truth, scene):
+    frames = {frame.name: frame for frame in (*scene.train, *scene.test)}
+    assert len(frames) == CAMERAS * FRAMES
+    assert [camera["fps"] for camera in truth["cameras"]] == [29.97, 30, 29.97]
+    offsets = [camera["offset"] for camera in truth["cameras"]]
+    assert min(offsets) == 0 < max(offsets) < LATEST
+    for camera in truth["cameras"]:
+        path = made / f"{camera['name']}.mp4"
+        np.testing.assert_allclose(stamps_of(path), np.arange(FRAMES) / camera["fps"], atol=1e-4)
+        film = read_film(path, SIZE * 3 // 4, SIZE)
+        of_camera = [frames[f"images/{camera['name']}_{number:04d}"] for number in range(FRAMES)]
+        true = np.stack([frame.load()[..., :3].numpy() for frame in of_camera])
+        away = np.abs((film[:, None] @ LUMA) - (true @ LUMA)).mean((2, 3))  # colours are coarser in a film
+        assert away.argmin(1).tolist() == [*range(FRAMES)]
+        assert away.diagonal().max() < 3
+        for number, frame in enumerate(of_camera):
+            seconds = camera["offset"] + number / camera["fps"]
+            assert frame.time * truth["seconds"] == pytest.approx(seconds)
+            np.testing.assert_allclose(frame.camera.camera_to_world, camera["camera_to_world"], atol=1e-9)
+    assert {frame.name[7:12] for frame in scene.test} == {"cam01"}
+
+
+def test_a_frame_of_which_only_what_moves_is_rendered_is_the_whole_image(truth, scene):
+    frame, world = scene.train[-1], hall(truth["seconds"])
+    whole, _ = render(world, frame.time, frame.camera, 2, SHADOW_RAYS)
+    away = np.abs(whole[..., :3].astype(float) - frame.load()[..., :3].numpy())
+    assert away.mean() < 3
+    assert away.max() < 30  # a JPEG's error
+
+
+def test_masks_mark_the_movers_alone(truth, scene):
+    for frame in scene.test:
+        mask = frame.load_moving().numpy()
+        assert 0.01 < mask.mean() < 0.1
+        for vertices in placed_movers(hall(truth["seconds"]), frame.time).values():
+            column, row = frame.camera.project(vertices.mean(0))[0].long().tolist()
+            assert mask[row, column]
+
+
+def test_all_cameras_hear_one_clap_at_its_true_time(made, truth):
+    for camera in truth["cameras"]:
+        sound = heard(made / f"{camera['name']}.mp4")
+        assert len(sound) == pytest.approx(FRAMES / camera["fps"] * HERTZ, abs=1100)
+        loud = np.flatnonzero(np.abs(sound) > 0.2)
+        assert loud[0] / HERTZ + camera["offset"] == pytest.approx(truth["clap"], abs=2e-3)
+        assert (loud[-1] - loud[0]) / HERTZ < 0.05
+        before = sound[: loud[0] - HERTZ // 100]
+        assert 0.003 < before.std() < 0.03
+
+
+def test_a_synchronised_rig_is_in_the_layout_of_dynerf(tmp_path):
+    arguments = {"cameras": 2, "frames": 2, "size": 32, "samples_per_pixel": 1, "workers": 1}
+    synthesize_multicam(tmp_path / "rig", **arguments, synchronised=True)
+    scene = multicam.read_scene(tmp_path, "rig", scale=1, normalise=False)
+    same = posed_video.read_scene(tmp_path / "rig", "truth", normalise=False, test_cameras=["cam00"])
+    assert (len(scene.train), len(scene.test)) == (len(same.train), len(same.test)) == (2, 2)
+    for frame, true in zip(scene.train + scene.test, same.train + same.test):
+        assert (frame.time, frame.camera_id) == (true.time, true.camera_id)
+        torch.testing.assert_close(frame.camera.camera_to_world, true.camera.camera_to_world)
+        assert frame.camera.fx == pytest.approx(true.camera.fx)
+        gray, true_gray = (image.load()[..., :3].numpy() @ LUMA for image in (frame, true))
+        assert np.abs(gray - true_gray).mean() < 3
+
+
+def test_cameras_surround_the_movers_and_neighbours_see_alike():
+    cameras = rig(12, 676, seed=3)
+    assert {(c.width, c.height) for c in cameras} == {(676, 506)}
+    axes = np.stack([c.camera_to_world[:3, 2].numpy() for c in cameras])
+    apart = np.degrees(np.arccos((axes[1:] * axes[:-1]).sum(-1)))
+    assert apart.max() < 15.5
+    around = np.degrees(np.unwrap(np.arctan2(axes[:, 1], axes[:, 0])))
+    assert 120 < abs(around[-1] - around[0]) < 180
+    for time in np.linspace(0, 1, 7):
+        for vertices in placed_movers(hall(4.0), time).values():
+            for camera in cameras:
+                distance = np.linalg.norm(vertices - camera.center.numpy(), axis=-1)
+                assert distance.min() > 1.9
+                assert distance.max() < 4
+                pixels, depth = camera.project(vertices)
+                assert ((pixels > 0) & (pixels < torch.tensor([676, 506]))).all()
+                assert (depth > 0).all()
