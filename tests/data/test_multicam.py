@@ -9,6 +9,7 @@ import torch
 
 from forewarp.data.batches import Sampler
 from forewarp.data.files import SceneError
+from forewarp.data.films import STORE
 from forewarp.data.images import CACHE, write_image
 from forewarp.data.module import MulticamDataModule
 from forewarp.data.multicam import FILE, read_scene, write_poses
@@ -69,9 +70,10 @@ def test_films_are_read_as_a_rig_whose_first_camera_is_held_out(films):
 
 
 @pytest.mark.slow
-def test_where_not_all_frames_fit_each_is_sought_in_its_film(films, monkeypatch):
+def test_with_no_room_in_memory_or_on_disk_each_frame_is_sought_in_its_film(films, monkeypatch):
     whole = [frame.load() for frame in read_scene(films, "toy").train]
     monkeypatch.setattr(CACHE, "limit", 2000)
+    monkeypatch.setattr(STORE, "limit", 0)
     scene = read_scene(films, "toy")
     (line,) = scene.protocol["assumed"]
     assert "all frames take 1.23e-05 GB, more than data.cache_bytes" in line

@@ -7,7 +7,14 @@ import torch
 from omegaconf import OmegaConf
 
 from forewarp.cli.train import beginning
-from forewarp.runs.build import build_run, check_trainer, device_for, hyperparameters, why_on_cpu
+from forewarp.runs.build import (
+    build_run,
+    check_trainer,
+    device_for,
+    frames_folder,
+    hyperparameters,
+    why_on_cpu,
+)
 from forewarp.runs.config import content_hash
 from tests.support.configs import composed
 
@@ -138,3 +145,19 @@ def test_hyperparameters_are_flat_and_hold_no_paths():
     assert found["stage.fine.lr.density"] == config.stage.fine.lr.density
     assert all(isinstance(value, bool | int | float | str) for value in found.values())
     assert not any("/" in str(value) or "root" in name for name, value in found.items())
+
+
+def test_runs_of_a_folder_share_decoded_frames(tmp_path, monkeypatch):
+    def folder(run, runs="runs"):
+        return frames_folder(OmegaConf.create({"run": str(run), "paths": {"runs": str(runs)}}))
+
+    monkeypatch.chdir(tmp_path)
+    ours = tmp_path / "runs" / ".frames"
+    assert folder("runs/toy/particles") == folder("runs/toy/plan/trials/0") == ours
+    assert folder("elsewhere/particles") == tmp_path / "elsewhere" / ".frames"
+    ours.mkdir(parents=True)
+    assert folder(tmp_path / "runs/toy/particles", "of another folder") == ours
+    (tmp_path / "theirs").mkdir()
+    (tmp_path / "theirs" / ".frames").symlink_to(ours)
+    assert folder("theirs/a/particles") == tmp_path / "theirs" / "a" / ".frames"  # no link is followed
+    assert content_hash(config_of()) == content_hash(config_of("+data.disk_cache_bytes=1"))

@@ -58,6 +58,7 @@ def test_a_folder_is_claimed_for_one_config(tmp_path):
     assert (stored.seed, stored.trust, stored.viewer, stored.command) == (0, None, False, None)
     (tmp_path / "coarse").mkdir()
     (tmp_path / "coarse" / "last.ckpt").touch()
+    claimed(finished=True, data={"root": str(tmp_path), "disk_cache_bytes": 1})  # changes no frame
     assert claimed(finished=True, trainer="cpu") == stored
     assert claimed(trainer="cpu").trainer == "cpu"
     for changes, says in (

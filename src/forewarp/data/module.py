@@ -16,6 +16,7 @@ from forewarp.data import dnerf, hypernerf, multicam, nhr, posed_video
 from forewarp.data.batches import Sampler, Targets, color_of
 from forewarp.data.checks import check_seen
 from forewarp.data.files import RECORD, fingerprint, mismatch, whole
+from forewarp.data.films import STORE, films_of
 from forewarp.data.images import CACHE
 from forewarp.scene.frame import Scene, Truth, middle_of, spread
 from forewarp.scene.view import Target
@@ -177,6 +178,8 @@ class SceneDataModule(LightningDataModule):
         seed: seed of the pixels, the background colours and the default choice of frames.
         views_per_step: training frames of one time that share a batch's rays.
         cache_bytes: most bytes of decoded images kept in the process; the last module's number counts.
+        disk_cache_bytes: most bytes of decoded frames of films on disk, where they do not all fit into
+            ``cache_bytes``; 0: none. They lie in ``frames_folder``, by default ``.frames`` beside the films.
         held_out: training frames that are never trained on (``hold_out``).
         train_views: most training frames to train on, of those that are left (``only``); None: all.
         canonical: another canonical time than the format's own (None): see ``with_canonical``.
@@ -201,6 +204,7 @@ class SceneDataModule(LightningDataModule):
         seed: int = 0,
         views_per_step: int = 1,
         cache_bytes: int = 1_500_000_000,
+        disk_cache_bytes: int = 100_000_000_000,
         held_out: int = 0,
         train_views: int | None = None,
         canonical: str | float | None = None,
@@ -209,12 +213,14 @@ class SceneDataModule(LightningDataModule):
         super().__init__()
         self.place = None if place is None else Path(place)
         self._read, self.cache_bytes, self.held_out = read, cache_bytes, held_out
+        self.disk_cache_bytes, self.frames_folder = disk_cache_bytes, None
         self._canonical, self._eval_background, self._train_views = canonical, eval_background, train_views
         self._draw = {"rays": rays, "background": background, "seed": seed, "views_per_step": views_per_step}
 
     @cached_property
     def scene(self) -> Scene:
         """The scene; its protocol names the background that it is measured on."""
+        self._bound_caches()
         scene = hold_out(with_canonical(self._read(), self._canonical), self.held_out)
         scene = only(scene, self._train_views)
         check_seen(scene)
@@ -234,10 +240,18 @@ class SceneDataModule(LightningDataModule):
         return Sampler(self.scene, **self._draw)
 
     def setup(self, stage: str | None = None) -> None:
-        """Read the scene, once, and refuse bad settings."""
-        CACHE.resize(self.cache_bytes)
+        """Read the scene, once, refuse bad settings, and decode films that do not fit into memory."""
+        self._bound_caches()
         _ = self.batches
         color_of(self._background(self.scene))
+        parts = (
+            self.scene.test if stage == "test" else (*self.scene.train, *self.scene.held, *self.scene.test)
+        )
+        STORE.fill(films_of(frame.load for frame in parts))
+
+    def _bound_caches(self) -> None:
+        CACHE.resize(self.cache_bytes)
+        STORE.resize(self.frames_folder, self.disk_cache_bytes)
 
     def targets(self, split: str) -> Targets:
         """Give the whole images of ``train``, ``val``, ``test`` or ``held``."""

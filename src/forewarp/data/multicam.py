@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -25,6 +25,7 @@ from forewarp.data.arrays import load_numpy
 from forewarp.data.cameras import MOST_UNITS, box_of, pose_of, space_of
 from forewarp.data.directions import inverted, other_readings
 from forewarp.data.files import mismatch, number, scene_folder, whole
+from forewarp.data.films import STORE, Film
 from forewarp.data.images import (
     CACHE,
     SUFFIXES,
@@ -98,68 +99,6 @@ class ReducedImage(StoredImage):
         return reduced(super()._decode(), self.factor)
 
 
-class Film:
-    """A video whose frames are decoded when they are needed.
-
-    Args:
-        path: of the video.
-        stamps: seconds of its frames.
-        size: (width, height), to which they are reduced.
-        bytes_of_all: of the decoded frames of all cameras. Where there is room to keep them, the first frame
-            that is needed has all of its video decoded; else each is sought in the file, which takes a tenth
-            of a second and more.
-    """
-
-    def __init__(self, path: Path, stamps: np.ndarray, size: tuple[int, int], bytes_of_all: int) -> None:
-        self.path, self.stamps, self.size, self.bytes_of_all = path, stamps, size, bytes_of_all
-        self.images = tuple(FilmImage(self, number) for number in range(len(stamps)))
-
-    def decoded(self, start: int, count: int) -> Iterator[Tensor]:
-        """Decode ``count`` frames from number ``start`` on: uint8 (H, W, 4) each, alpha 255.
-
-        Raises:
-            SceneError: where one is not there, or of another size.
-        """
-        gap = float(np.diff(self.stamps).min()) if len(self.stamps) > 1 else 1.0
-        after = None if start == 0 else float(self.stamps[start]) - gap / 2
-        images = extracted(
-            self.path, None, max(self.size), start=after
-        )  # ffmpeg averages several times as fast
-        for index in range(start, start + count):
-            pixels = next(images, None)
-            if pixels is None:
-                expected = f"{len(self.stamps)} frames, as its index says"
-                raise mismatch(self.path, expected, index, "convert the video")
-            if pixels.shape[1::-1] != self.size:
-                raise mismatch(f"{self.path}: frame {index}", by(self.size), by(pixels.shape[1::-1]))
-            opaque = np.full((*pixels.shape[:2], 4), 255, np.uint8)
-            opaque[..., :3] = pixels
-            yield torch.from_numpy(opaque)
-        images.close()
-
-
-class FilmImage:
-    """Frame ``number`` of a film, uint8 (H, W, 4); kept while there is room, and read-only."""
-
-    def __init__(self, film: Film, number: int) -> None:
-        self.film, self.number = film, number
-
-    def __call__(self) -> Tensor:
-        """Give the pixels; SceneError as ``Film.decoded``."""
-        return CACHE.get(self, self._decode)
-
-    def _decode(self) -> Tensor:
-        if self.film.bytes_of_all > CACHE.limit:
-            (pixels,) = self.film.decoded(self.number, 1)
-            return pixels
-        for image, pixels in zip(self.film.images, self.film.decoded(0, len(self.film.images))):
-            if image is self:
-                own = pixels
-            else:
-                CACHE.keep(image, pixels)
-        return own
-
-
 def read_scene(
     root: str | Path,
     scene: str,
@@ -207,7 +146,7 @@ def read_scene(
     cameras = [_camera(row, scale) for row in rows]
     bytes_of_all = 4 * count * sum(camera.width * camera.height for camera in cameras)
     films = [track.path.name for track in tracks if track.stamps is not None]
-    if films and bytes_of_all > CACHE.limit:
+    if films and bytes_of_all > CACHE.limit and STORE.limit == 0:
         line = (
             f"all frames take {bytes_of_all / 1e9:.3g} GB, more than data.cache_bytes: each is sought in its"
         )

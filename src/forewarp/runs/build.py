@@ -15,6 +15,7 @@ from lightning.pytorch.profilers import AdvancedProfiler, SimpleProfiler
 from omegaconf import DictConfig, OmegaConf
 
 from forewarp.clock import Clock
+from forewarp.data.films import FOLDER
 from forewarp.runs.config import IDENTITY, instead_of
 from forewarp.runs.overrides import TEXTS, key_of
 from forewarp.training.callbacks import StageProgress
@@ -23,6 +24,7 @@ from forewarp.training.schedule import StagePlan, seconds_after, share_out
 from forewarp.training.stages import Run
 
 PROFILERS = {"simple": SimpleProfiler, "advanced": AdvancedProfiler}  # Lightning's
+_LEVELS = 4  # that a run may lie below the folder of all runs
 PROFILE = "profile"  # of a file's name: fit-profile.txt
 
 
@@ -39,6 +41,7 @@ def build_run(config: DictConfig) -> Run:
     check_trainer(config.trainer)
     device = partial(device_for, config)
     data = instantiate(config.data, _convert_="all")
+    data.frames_folder = frames_folder(config)
     plans = {name: stage_of(name, stage) for name, stage in config.stage.items()}
     factories = [make for make in instantiate(config.callbacks, _convert_="all").values() if make is not None]
     trainer = instantiate(config.trainer, _convert_="all")
@@ -85,6 +88,20 @@ def build_run(config: DictConfig) -> Run:
     )
     run.check()
     return run
+
+
+def frames_folder(config: DictConfig) -> Path:
+    """Say where a run keeps decoded frames of films: ``.frames`` in the folder of all runs, which share them,
+    or beside a run that lies elsewhere; where a folder above the run has one already, there.
+
+    Not beside the data, which may be read-only or on a slow disk, nor where a key says: a run's config may
+    come from anyone.
+    """
+    run = Path(config.run).resolve()
+    runs = Path(OmegaConf.select(config, "paths.runs") or run.parent).resolve()
+    above = list(run.parents[:_LEVELS])
+    known = (folder for folder in above if (folder / FOLDER).is_dir() and not (folder / FOLDER).is_symlink())
+    return next(known, runs if runs in above else run.parent) / FOLDER
 
 
 def loggers_of(config: DictConfig) -> RunLoggers:

@@ -16,7 +16,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from forewarp.data.files import LOCK, difference
 from forewarp.files import read_json, read_text, refuse_links, replace_file, write_json
-from forewarp.runs.config import IDENTITY, make_absolute, read_config
+from forewarp.runs.config import IDENTITY, NOT_OF_RUN, make_absolute, read_config
 from forewarp.runs.overrides import command_line, typed_folders, typed_overrides
 from forewarp.training.stages import Run
 
@@ -124,6 +124,8 @@ def claim(config: DictConfig, *, finished: bool = False) -> None:
 def _refuse_another(path: Path, stored: DictConfig, config: DictConfig) -> None:
     """Refuse a config that describes another run than the one stored at ``path``; name a differing key."""
     before, now = ({k: OmegaConf.to_container(c).get(k) for k in IDENTITY} for c in (stored, config))
+    for part in (before["data"], now["data"]):
+        (part or {}).pop(NOT_OF_RUN, None)
     if differ := list(_differences(before, now)):
         key, was, got = min(differ, key=lambda row: [not row[0].startswith(first) for first in _TYPED])
         more = f" (and {len(differ) - 1} more keys)" if len(differ) > 1 else ""
