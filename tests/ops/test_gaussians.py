@@ -379,11 +379,32 @@ def gradients_of(compared):
     return (*compared.particles, compared.maps, compared.skin, compared.pixel_gradient)
 
 
-@pytest.mark.parametrize("options", [{}, {"width": 0.5, "factor": 0.01}])
+def sensed(kind=F64, seed=3):
+    """Depths about the crowd's, a third of them holes, and confidences."""
+    generator = torch.Generator().manual_seed(seed)
+    depth, trust, hole = torch.rand(3, SIZE[0] * SIZE[1], generator=generator, dtype=F64)
+    return torch.stack([torch.where(hole < 0.3, 0.0, 3 + 2 * depth), trust]).to(kind)
+
+
+VALID = torch.arange(SIZE[0] * SIZE[1]) % 3 > 0
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        {"width": 0.5, "factor": 0.01},
+        {"valid": VALID},
+        {"sensed": sensed(), "by_depth": 2.5, "deep": 0.2},
+        {"sensed": sensed(), "valid": VALID, "factor": 0.01},
+    ],
+)
 def test_compare_by_the_kernel_equals_the_reference(options):
     exact, fast = run(F64, **options), run(F32, **options)
     assert fast.loss == pytest.approx(exact.loss, rel=1e-5)
     assert fast.squared == pytest.approx(exact.squared, rel=1e-5)
+    assert fast.depth == pytest.approx(exact.depth, rel=1e-5)
+    assert (exact.depth > 0) == ("sensed" in options)
     close_in_norm(gradients_of(exact), gradients_of(fast), 2e-5)
     assert fast.order.tolist() == exact.order.tolist()
     assert fast.distances.shape == exact.distances.shape == fast.pixel_gradient.shape
@@ -407,6 +428,26 @@ def test_the_loss_of_nothing(backend):
     assert compared.squared == pytest.approx(2.0)
     assert compared.loss == pytest.approx(2 * (math.sqrt(1.01) - 0.1), rel=1e-5)
     assert alone(nothing, (255, 0, 0, 0), 0.0).loss == 0  # what is transparent shows what is behind it
+
+
+def test_depth_pulls_along_the_ray_and_says_nothing_of_opacity(backend):
+    """A particle at distance 4, of a ray on which 4, 5 or nothing was measured; colour asks for nothing."""
+    gray = {"truth": (127, 127, 127, 255), "background": 0.498, "deep": 0.01}
+    known = torch.full((2, 256), 4.0)
+    known[1] = 1.0
+    right = alone(one(scale=0.3), **gray, sensed=known)
+    wrong = alone(one(scale=0.3), **gray, sensed=known * torch.tensor([[1.25], [1.0]]))
+    none = alone(one(scale=0.3), **gray, sensed=known * torch.tensor([[0.0], [1.0]]))
+    doubted = alone(one(scale=0.3), **gray, sensed=known * torch.tensor([[1.25], [0.25]]))
+    assert right.depth < 1e-3 * wrong.depth
+    assert wrong.particles.means[0, 2].item() < -1  # farther would be better
+    assert wrong.particles.opacity.item() > 0  # and less of it
+    assert abs(right.particles.opacity.item()) < 1e-3 * wrong.particles.opacity.item()
+    assert none.depth == 0
+    assert doubted.depth == pytest.approx(wrong.depth / 4, rel=1e-5)
+    assert doubted.particles.means[0, 2].item() == pytest.approx(
+        wrong.particles.means[0, 2].item() / 4, rel=1e-3
+    )
 
 
 def test_a_perfect_image_has_no_loss_and_no_gradient(backend):
@@ -478,6 +519,8 @@ def test_two_threads_give_the_same(two_threads):
         (pixels()[:-1], {}, r"pixels: expected shape \(609, 4\)"),
         (pixels().float(), {}, "expected uint8 pixels"),
         (pixels(), {"width": 0.0}, "width > 0"),
+        (pixels(), {"sensed": sensed()[:, :-1]}, r"sensed: expected shape \(2, 609\)"),
+        (pixels(), {"valid": VALID[1:]}, r"valid: expected shape \(609\)"),
         (pixels(), {"kinds": (1, 2)}, "kinds: expected 11 coefficients in all, but got"),
     ],
 )
@@ -492,7 +535,9 @@ def test_the_fused_loss_is_that_of_a_callable(kind):
         assert image.shape == truth.shape == (SIZE[1], SIZE[0], 3)
         return ((image - truth).square() + 0.5**2).sqrt().sub(0.5).sum()
 
-    fused, called = (run(kind, width=0.5, factor=0.01, loss=loss) for loss in (None, robust))
+    options = {"width": 0.5, "factor": 0.01, "sensed": sensed(kind), "by_depth": 3.0, "valid": VALID}
+    fused, called = (run(kind, **options, loss=loss) for loss in (None, robust))
+    assert called.depth == pytest.approx(fused.depth, rel=1e-5)
     assert called.loss == pytest.approx(fused.loss, rel=1e-5)
     assert called.squared == pytest.approx(fused.squared, rel=1e-5)
     close_in_norm(gradients_of(fused), gradients_of(called), 2e-5)

@@ -156,7 +156,12 @@ class Sampler(IterableDataset):
         if frame.load_valid is not None and view.pixels is None:
             valid = frame.load_valid().flatten()
             valid = valid if rows is None else valid[rows]
-        return Observation(Moment(frame.time, index, frame.camera_id), view, rgb, background, valid)
+        sensed = None
+        if self.asks.sensed and frame.load_sensed is not None:
+            sensed = frame.load_sensed().flatten(1)
+            sensed = sensed if rows is None else sensed[:, rows]
+        moment = Moment(frame.time, index, frame.camera_id)
+        return Observation(moment, view, rgb, background, valid, sensed)
 
     def _colors(self, count: int) -> Tensor:
         """Choose colours (count, 3) behind pixels."""

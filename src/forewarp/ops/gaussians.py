@@ -24,6 +24,7 @@ CHUNK = (
     1 << 22
 )  # pairs of a splat and a pixel that the reference holds: with gradients some 12 tensors of them
 FLAT = 0.28209479177387814  # the first harmonic, 1 / sqrt(4 pi), which no direction changes
+DEEP = 0.03  # relative error of depth at which its loss turns from a square to a line
 LEAST_LOG = -math.log(255.0)  # of an alpha: less than a 255th is not seen
 MOST = 1 << 15  # splats of a tile that count, the nearest ones
 SIDE = 8  # pixels of a tile along both axes
@@ -523,15 +524,17 @@ def _splat_gradients(splats: Tensor, tiles: _Tiles, sums: Tensor, factor: float)
 
 
 class ImageLoss(NamedTuple):
-    """``loss`` and ``squared``: sums over pixels and channels; ``particles``, ``maps`` and ``skin``: the
-    gradients of ``factor`` times the loss; ``pixel_gradient`` (N,): the length of its gradient by the pixel
-    where a particle lies, 0 of particles that the image does not show. ``order`` (V,): the rows of those that
-    the image may show, from near to far; ``distances`` (N,): from the camera, known of these alone. Where
-    ``kinds`` of colours are asked for, ``particles.colors`` is a tuple of tensors.
+    """``loss`` and ``squared``: sums over pixels and channels; ``depth``: that of depth, over pixels by their
+    confidence; ``particles``, ``maps`` and ``skin``: the gradients of ``factor`` times the loss, and of
+    depth's by its weight; ``pixel_gradient`` (N,): the length of theirs by the pixel where a particle lies, 0
+    of particles that the image does not show. ``order`` (V,): the rows of those that the image may show, from
+    near to far; ``distances`` (N,): from the camera, known of these alone. Where ``kinds`` of colours are
+    asked for, ``particles.colors`` is a tuple of tensors.
     """
 
     loss: float
     squared: float
+    depth: float
     particles: Gaussians
     maps: Tensor
     skin: Tensor | None
@@ -554,12 +557,20 @@ def compare(
     by_skin: bool = False,
     kinds: Sequence[int] | None = None,
     loss: Callable[[Tensor, Tensor], Tensor] | None = None,
+    valid: Tensor | None = None,
+    sensed: Tensor | None = None,
+    by_depth: float = 1.0,
+    deep: float = DEEP,
     chunk: int = CHUNK,
 ) -> ImageLoss:
     """The loss ``sum sqrt(e^2 + width^2) - width`` over pixels and channels, and its gradients.
 
     ``e`` is the image of ``project`` and ``rasterize`` over ``background`` less the truth over the same:
     near 0 the loss is a square, far from it the error itself. A ``loss`` of the image takes its place.
+
+    Where depth is known it has a loss of the same form besides, of ``e = sum_i w_i (d_i / d - 1)``, with w_i
+    what splat i shows of itself in a pixel, and d_i its distance: what lies at the known distance d is as it
+    should be however opaque it is, as opacity is for the colours to tell.
 
     Args:
         particles, warp, pinhole, color_basis, opacity_basis: as of ``project``.
@@ -572,6 +583,10 @@ def compare(
             None: all (N, B, 3) are in one.
         loss: called with the image and the truth (H, W, 3), returns a differentiable (); autograd leads from
             it to the kernels. None: the loss above, which a kernel computes together with its gradients.
+        valid: (H W,) bool; elsewhere the image counts as equal to the truth. None: all pixels count.
+        sensed: (2, H W), distances along the pixels' rays, 0 where not known, and their confidence in [0, 1].
+        by_depth: weight of the loss of depth beside the other.
+        deep: relative error at which the loss of depth turns from a square to a line, > 0.
         chunk: as of ``rasterize``.
 
     Returns:
@@ -593,14 +608,30 @@ def compare(
             f"kinds: expected {particles.colors.shape[1]} coefficients in all, but got {tuple(kinds)}"
         )
     seen = particles, warp, pinhole, color_basis, opacity_basis
+    for name, plane, shape in (("valid", valid, (len(pixels),)), ("sensed", sensed, (2, len(pixels)))):
+        if plane is not None:
+            check_shape(name, plane, shape)
     given = pixels, background, width, factor, by_skin, kinds
+    beside = valid, sensed, by_depth, deep
     if loss is None and use_numba(particles.means) and particles.means.dtype == torch.float32:
-        return _compare_numba(*seen, *given)
-    return compare_reference(seen, *given, loss, chunk)
+        return _compare_numba(*seen, *given, *beside)
+    return compare_reference(seen, *given, loss, *beside, chunk)
 
 
 def compare_reference(
-    seen: tuple, pixels, background, width, factor, by_skin, kinds, loss=None, chunk=CHUNK
+    seen: tuple,
+    pixels,
+    background,
+    width,
+    factor,
+    by_skin,
+    kinds,
+    loss=None,
+    valid=None,
+    sensed=None,
+    by_depth=1.0,
+    deep=DEEP,
+    chunk=CHUNK,
 ) -> ImageLoss:
     """``compare`` in plain PyTorch, on any device and in any precision; a ``loss`` by ``project`` and
     ``rasterize``, which use kernels. ``seen`` are the arguments of ``project``.
@@ -612,20 +643,27 @@ def compare_reference(
         splats = (project if loss else project_reference)(own, own_warp, pinhole, *bases)
         splats.values.retain_grad()
         if loss:
-            color, _, transmittance = rasterize(splats, *pinhole.size, chunk)
+            color, far, transmittance = rasterize(splats, *pinhole.size, chunk)
         else:
             planes = rasterize_reference(splats, *pinhole.size, chunk)
-            color, transmittance = planes[:3], planes[4]
+            color, far, transmittance = planes[:3], planes[3], planes[4]
         behind = background.to(color)
         drawn = color + transmittance * behind[:, None, None]
         straight = pixels.to(color) / 255
         truth = torch.lerp(behind.expand_as(straight[:, :3]), straight[:, :3], straight[:, 3:])
-        error = drawn.reshape(3, -1).T - truth
+        shown = drawn.reshape(3, -1).T
+        shown = shown if valid is None else torch.where(valid[:, None], shown, truth)
+        error = shown - truth
         if loss:
-            value = loss(drawn.permute(1, 2, 0), truth.reshape(*drawn.shape[1:], 3))
+            value = loss(shown.reshape(*drawn.shape[1:], 3), truth.reshape(*drawn.shape[1:], 3))
         else:
             value = ((error.square() + width**2).sqrt() - width).sum()
-        (factor * value).backward()
+        of_depth = value.new_zeros(())
+        if sensed is not None:
+            inverse, trust = _inverse_and_trust(sensed.to(far))
+            wrong = far.flatten() * inverse + transmittance.flatten() - 1
+            of_depth = (trust * ((wrong.square() + deep**2).sqrt() - deep)).sum()
+        (factor * (value + by_depth * of_depth)).backward()
     found = [torch.zeros_like(leaf) if leaf.grad is None else leaf.grad for leaf in leaves]
     pixel_gradient = splats.values.grad[:, :2].norm(dim=-1)
     squared = float(error.detach().square().sum())
@@ -634,7 +672,15 @@ def compare_reference(
     order = seen[away[seen].argsort(stable=True)]
     colors = found[4] if kinds is None else found[4].split(list(kinds), 1)
     gradients = Gaussians(*found[:4], colors)
-    return ImageLoss(float(value.detach()), squared, gradients, found[5], skin, pixel_gradient, order, away)
+    losses = float(value.detach()), squared, float(of_depth.detach())
+    return ImageLoss(*losses, gradients, found[5], skin, pixel_gradient, order, away)
+
+
+def _inverse_and_trust(sensed: Tensor) -> tuple[Tensor, Tensor]:
+    """Return inverse distances (H W,) and their confidence, both 0 where none is known."""
+    distance, trust = sensed
+    known = distance > 0
+    return torch.where(known, 1 / distance, 0.0), torch.where(known, trust, 0.0)
 
 
 def _by_softmax(weights: Tensor, by_weights: Tensor) -> Tensor:
@@ -644,13 +690,36 @@ def _by_softmax(weights: Tensor, by_weights: Tensor) -> Tensor:
 
 
 def _compare_numba(
-    particles, warp, pinhole, color_basis, opacity_basis, pixels, background, width, factor, by_skin, kinds
+    particles,
+    warp,
+    pinhole,
+    color_basis,
+    opacity_basis,
+    pixels,
+    background,
+    width,
+    factor,
+    by_skin,
+    kinds,
+    valid,
+    sensed,
+    by_depth,
+    deep,
 ) -> ImageLoss:
     threads, (across, down), camera = match_threads(), pinhole.size, pinhole.row(particles.means)
     inputs, splats = _project_numba(*particles, *warp, camera, color_basis, opacity_basis)
     tiles = _sorted_tiles(splats.numpy(), across, down, threads)
-    image = pixels.contiguous().view(torch.int32).reshape(down, across)
-    return _compare_sorted(inputs, splats, tiles, image, background, width, factor, by_skin, kinds)
+    image, planes = pixels.contiguous().view(torch.int32).reshape(down, across), None
+    if valid is not None or sensed is not None:
+        planes = splats.new_zeros(3, down, across)
+        planes[0] = 1.0 if valid is None else valid.reshape(down, across)
+        if sensed is not None:
+            inverse, trust = _inverse_and_trust(sensed.to(splats))
+            planes[1:] = torch.stack([inverse, by_depth * trust]).reshape(2, down, across)
+    found = _compare_sorted(
+        inputs, splats, tiles, image, background, width, factor, by_skin, kinds, planes, deep
+    )
+    return found._replace(depth=found.depth / (by_depth or 1.0))
 
 
 def compile_backward_kernels(
@@ -666,17 +735,24 @@ def compile_backward_kernels(
     _compare_sorted(inputs, splats, tiles, image, torch.ones(3), 1.0, 1.0, False, None)
 
 
-def _compare_sorted(inputs, splats, tiles, image, background, width, factor, by_skin, kinds) -> ImageLoss:
-    """Compare sorted splats with an image (H, W) int32 of four bytes a pixel; carry the gradients back."""
+def _compare_sorted(
+    inputs, splats, tiles, image, background, width, factor, by_skin, kinds, planes=None, deep=DEEP
+) -> ImageLoss:
+    """Compare sorted splats with an image (H, W) int32 of four bytes a pixel, and the kernel's ``planes``
+    (3, H, W), if any; carry the gradients back.
+    """
     from forewarp.ops.kernels import rasterize as kernels
 
     kept, (count, coefficients) = _kept_for(tiles), inputs[4].shape[:2]
     sums = torch.empty(len(kept), len(tiles.order), SPLAT)
-    scores = torch.zeros(len(kept), 2, dtype=torch.float64)
+    scores = torch.zeros(len(kept), 3, dtype=torch.float64)
     (high, wide), edge = image.shape, (0, -image.shape[1] % SIDE, 0, -image.shape[0] % SIDE)
     padded = pad(image, edge) if any(edge) else image
     truth = padded.numpy().view("uint32"), wide, high, *arrays(background.float()), np.float32(width)
-    kernels.compare(*tiles.lists, *truth, *arrays(kept, sums, scores))
+    beside = None
+    if planes is not None:
+        beside = (pad(planes, edge) if any(edge) else planes).contiguous().numpy()
+    kernels.compare(*tiles.lists, *truth, beside, np.float32(deep), *arrays(kept, sums, scores))
     seen, by_splat, pixel_gradient = _splat_gradients(splats, tiles, sums, factor)
     gradients, colors, maps, skin = _chain(
         inputs, splats, seen, by_splat, len(kept), kinds or [coefficients], by_weights=by_skin, softmax=True

@@ -105,6 +105,7 @@ class Asks:
     ``kind``: single ``pixels``, square ``crops`` of ``side`` pixels, or ``pictures``, whole images.
     ``neighbours``: how many of the nearest other training times to observe too. ``instant``: up to how many
     whole training images of the picked time to add. ``straight``: give pixels as stored, not composited.
+    ``sensed``: give the depth of pixels where a sensor measured it.
     """
 
     kind: str = "pixels"
@@ -112,6 +113,7 @@ class Asks:
     neighbours: int = 0
     instant: int = 0
     straight: bool = False
+    sensed: bool = False
 
     def __post_init__(self) -> None:
         if self.kind not in KINDS or min(self.side - 1, self.neighbours, self.instant) < 0:
@@ -124,6 +126,8 @@ class Observation:
     """Pixels of one image: the true ``rgb`` (R, 3) in [0, 1] over ``background`` (3,) or (R, 3), the colour
     of rays that hit nothing. If the method asks for ``straight`` pixels, ``rgb`` is (R, 4) uint8: colour
     and alpha as stored. ``valid`` (R,) bool: those to learn from; None: all, as always of single pixels.
+    ``sensed`` (2, R), if asked for and known: the depth of their rays, 0 where there is none, and its
+    confidence.
     """
 
     moment: Moment
@@ -131,13 +135,15 @@ class Observation:
     rgb: Tensor
     background: Tensor
     valid: Tensor | None = None
+    sensed: Tensor | None = None
 
     __repr__ = brief
 
     def to(self, device) -> Observation:
-        """Move the colours to another device; the view stays on the CPU."""
-        valid = None if self.valid is None else self.valid.to(device)
-        return replace(self, rgb=self.rgb.to(device), background=self.background.to(device), valid=valid)
+        """Move what is known of the pixels to another device; the view stays on the CPU."""
+        names = ("rgb", "background", "valid", "sensed")
+        known = {name: getattr(self, name) for name in names if getattr(self, name) is not None}
+        return replace(self, **{name: tensor.to(device) for name, tensor in known.items()})
 
 
 @dataclass(frozen=True)

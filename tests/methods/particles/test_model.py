@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from forewarp.data.batches import composited
+from forewarp.data.module import SceneDataModule
 from forewarp.methods.effect import switched
 from forewarp.methods.method import Start
 from forewarp.methods.particles import model
@@ -74,12 +75,65 @@ def test_image_losses_are_weighted_with_the_photo_term():
     shaken(module).method.nodes.seen_times.copy_(torch.tensor([0.0, 1.0]))
     for factors in ({"photo": 1.0}, {"dssim": 1.0}, {"photo": 2.0, "dssim": 0.5}):
         steps.append(look(module, DATA, 3, factors))
+    assert (
+        steps[0].terms.pop("depth")()
+        is steps[1].terms.pop("depth")()
+        is steps[2].terms.pop("depth")()
+        is None
+    )
     photo, dssim, both = ({name: float(value()) for name, value in step.terms.items()} for step in steps)
     assert (both["photo"], both["dssim"]) == pytest.approx((photo["photo"], dssim["dssim"]), rel=1e-5)
     assert dssim["dssim"] > 0.01
     for name, gradient in steps[2].gradients.items():
         expected = 2.0 * steps[0].gradients[name] + 0.5 * steps[1].gradients[name]
         assert float((gradient - expected).norm()) <= 1e-4 * float(expected.norm()) + 1e-12, name
+
+
+def with_depth(data, shown=slice(None)):
+    """The data with the depth of its images' pixels, measured where they show the ball."""
+    scene = data.scene
+
+    def measured(frame):
+        depth = (frame.load()[..., 3] > 127) * 4.0
+        return lambda: torch.stack([depth, torch.ones_like(depth)])
+
+    train = [
+        replace(f, load_sensed=measured(f)) if i in range(99)[shown] else f for i, f in enumerate(scene.train)
+    ]
+    data = SceneDataModule(lambda: replace(scene, train=tuple(train)), rays=1)
+    data.setup("fit")
+    return data
+
+
+@pytest.mark.parametrize("beside", [{}, {"dssim": 0.3}])
+def test_depth_is_a_term_that_weighs_as_it_says(beside):
+    data = with_depth(DATA)
+    module = module_with(data, numbers={"jitter": 0.0}, weights={"photo": 1.0, "depth": 1.0})
+    shaken(module).method.nodes.seen_times.copy_(torch.tensor([0.0, 1.0]))
+    data.asks, steps = module.method.asks, []
+    for factors in ({"photo": 1.0}, {"photo": 1.0, "depth": 1.0}, {"photo": 2.0, "depth": 0.5}):
+        steps.append(look(module, data, 3, factors | beside))
+    once, twice = (float(step.terms["depth"]()) for step in steps[1:])
+    assert once == pytest.approx(twice, rel=1e-5)
+    assert once > 0.01
+    if beside:
+        return
+    for name, gradient in steps[2].gradients.items():
+        expected = 1.5 * steps[0].gradients[name] + 0.5 * steps[1].gradients[name]
+        assert float((gradient - expected).norm()) <= 1e-4 * float(expected.norm()) + 1e-12, name
+
+
+def test_depth_is_not_asked_for_where_it_has_no_weight_or_no_sensor():
+    data = with_depth(DATA, slice(1, 2))
+    off = module_with(data, weights={"photo": 1.0, "depth": 0.0}).method
+    assert (off.asks.sensed, off.has_planes) == (False, False)
+    on = module_with(data, weights={"photo": 1.0, "depth": 1.0})
+    assert (on.method.asks.sensed, on.method.has_planes) == (True, True)
+    data.asks = on.method.asks
+    factors = {"photo": 1.0, "depth": 1.0}
+    found = [look(on, data, index, factors).terms["depth"]() for index in (0, 1)]
+    assert found[0] is None
+    assert float(found[1]) > 0
 
 
 def test_two_views_of_a_time_count_as_one_step():

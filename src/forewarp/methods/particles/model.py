@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from functools import partial
 from typing import ClassVar
 
@@ -28,6 +29,7 @@ from forewarp.methods.rows import RowsAdam
 from forewarp.ops.gaussians import (
     BLUR,
     CHUNK,
+    DEEP,
     Gaussians,
     Warp,
     compare,
@@ -55,12 +57,13 @@ class Particles(Method):
     Args:
         start: what it is built from; for the stage's numbers see ``options.Numbers``.
         width: error at which the photometric loss turns from a square to a line.
+        deep: relative error at which the loss of depth does.
         blur: square pixels added to the variance of every splat.
         chunk: pairs of a splat and a pixel in memory at once, where there are no kernels.
         choices: see ``options.Effects``.
     """
 
-    terms = ("photo", *IMAGE_LOSSES, "rigid", "smooth")
+    terms = ("photo", *IMAGE_LOSSES, "depth", "rigid", "smooth")
     numbers = tuple(key for key in Numbers.__dataclass_fields__ if key != "name")
     asks = Asks(kind="pictures", straight=True)
     effects = EFFECTS
@@ -73,12 +76,25 @@ class Particles(Method):
     moving, in_motion, only = queries.moving, queries.in_motion, queries.only
 
     def __init__(
-        self, start: Start, *, width: float = 0.05, blur: float = BLUR, chunk: int = CHUNK, **choices
+        self,
+        start: Start,
+        *,
+        width: float = 0.05,
+        deep: float = DEEP,
+        blur: float = BLUR,
+        chunk: int = CHUNK,
+        **choices,
     ) -> None:
         super().__init__()
         self.stage = Numbers(name=start.stage, **start.numbers)
         self.canonical_time, self.width, self.blur = start.scene.canonical_time, width, blur
-        self.chunk = chunk
+        self.deep, self.chunk = deep, chunk
+        if start.weights.get("depth"):
+            self.asks = replace(self.asks, sensed=True)
+        # Whether a step's images come with planes beside their colours, which the kernels are compiled for.
+        self.has_planes = any(
+            frame.load_valid or (self.asks.sensed and frame.load_sensed) for frame in start.scene.train
+        )
         self.views, times = len(start.scene.train), start.scene.times
         effects = Effects(**choices).only(self.stage.effects, len(times))
         self.ends = min(times), max(times)
@@ -230,16 +246,19 @@ class Particles(Method):
     def look(self, batch: Batch, factors: Mapping[str, float], generator: torch.Generator) -> Step:
         """See ``Method``. Images are rendered one after the other, each as a whole."""
         terms, gradients = dict.fromkeys(self.terms, 0.0), {}
-        squared, numbers, views = 0.0, 0, len(batch.observations)
+        squared, numbers, views, has_depth = 0.0, 0, len(batch.observations), False
         for seen in batch.observations:
             squared_error, of_image, found = self._compare(seen, factors, generator, views)
             count = len(seen.view) if seen.valid is None else int(seen.valid.sum())
             squared, numbers = squared + squared_error, numbers + 3 * count
             for name, value in of_image.items():
                 terms[name] += value / views
+            has_depth |= seen.sensed is not None
             for name, value in found.items():
                 gradients[name] = gradients[name] + value if name in gradients else value
         values = {name: (lambda v=v: self.means.new_tensor(v)) for name, v in terms.items()}
+        if not has_depth:
+            values["depth"] = lambda: None
         if self.nodes is None:
             values["rigid"] = values["smooth"] = lambda: None
         error = torch.tensor(squared / numbers, dtype=torch.float64)
@@ -263,15 +282,18 @@ class Particles(Method):
             motion, maps = nodes.motion_and_maps(basis)
             warp = Warp(maps, self.skinning.links, self.skinning.weights())
         colors, terms = self._color_parameters(), {}
-        loss, covered = self._image_loss(factors, terms, seen.valid), float(self.covered_pixels)
-        factor = (factors.get("photo", 0.0) if loss is None else 1.0) / (covered * views)
+        loss, covered = self._image_loss(factors, terms), float(self.covered_pixels)
+        of_colors = factors.get("photo", 0.0) if loss is None else 1.0
+        sensed = seen.sensed if "depth" in factors else None
         compared = compare(
             self.gaussians(), warp, pinhole_of(seen.view.camera, self.blur), *self.time_bases(time),
-            seen.rgb, seen.background, width=self.width, factor=factor, by_skin=self.moves,
-            kinds=[getattr(self, name).shape[1] for name in colors], loss=loss, chunk=self.chunk,
+            seen.rgb, seen.background, width=self.width, factor=of_colors / (covered * views),
+            by_skin=self.moves, kinds=[getattr(self, name).shape[1] for name in colors], loss=loss,
+            valid=seen.valid, sensed=sensed, by_depth=factors.get("depth", 0.0) / of_colors, deep=self.deep,
+            chunk=self.chunk,
         )  # fmt: skip
-        squared = terms.pop("squared", compared.squared)
-        terms = {name: value / covered for name, value in (terms or {"photo": compared.loss}).items()}
+        terms = {"depth": compared.depth} | (terms or {"photo": compared.loss})
+        terms = {name: value / covered for name, value in terms.items()}
         shown = compared.pixel_gradient > 0
         self.gradient_sum.add_(compared.pixel_gradient)
         self.image_count.add_(shown)
@@ -291,29 +313,21 @@ class Particles(Method):
             smooth, extent = factors.get("smooth", 0.0), float(self.extent)
             terms["smooth"], of_nodes = nodes.backward(time, motion_time, basis, by_motion, smooth, extent)
             gradients |= {"skinning.logits": compared.skin, **of_nodes}
-        return squared, terms, gradients
+        return compared.squared, terms, gradients
 
-    def _image_loss(
-        self, factors: Mapping[str, float], terms: dict[str, float], valid: Tensor | None
-    ) -> Callable | None:
-        """Return the weighted sum of all losses of an image, which notes each in ``terms``.
-
-        Where pixels are not ``valid`` (R,) the image counts as equal to the truth and has no gradient; the
-        ``squared`` error is noted too then. None if ``photo`` is the only loss and all pixels are valid: a
-        kernel computes it together with its gradients.
+    def _image_loss(self, factors: Mapping[str, float], terms: dict[str, float]) -> Callable | None:
+        """Return the weighted sum of all losses of an image, which notes each in ``terms``; None if ``photo``
+        is the only one: a kernel computes it together with its gradients.
         """
         losses = {"photo": partial(robust, width=self.width)} | IMAGE_LOSSES
         losses = {name: loss for name, loss in losses.items() if name in factors}
-        if losses.keys() <= {"photo"} and (valid is None or not losses):
+        if losses.keys() == {"photo"}:
             return None
 
         def weighted(image: Tensor, truth: Tensor) -> Tensor:
-            if valid is not None:
-                image = torch.where(valid.reshape(*image.shape[:2], 1), image, truth)
-                terms["squared"] = float((image.detach() - truth).square().sum())
             values = {name: loss(image, truth) for name, loss in losses.items()}
             terms.update({name: float(value.detach()) for name, value in values.items()})
-            return sum(factors[name] * value for name, value in values.items())
+            return sum((factors[name] * value for name, value in values.items()), 0.0 * image.sum())
 
         return weighted
 

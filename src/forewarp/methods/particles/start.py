@@ -1,5 +1,5 @@
-"""Where particles begin: on the visual hull, at known points, or where neighbouring views agree; and their
-kernels compiled ahead.
+"""Where particles begin: on the visual hull, at measured depths, at known points, or where neighbouring views
+agree; and their kernels compiled ahead.
 """
 
 from __future__ import annotations
@@ -48,14 +48,20 @@ _SIDE = 64  # lattice points along the longer side of an image
 _SWEPT, _NEIGHBOURS = 10, 8  # images that are swept; neighbours in time of each
 _NEAREST_PLANE = 0.02  # share of the far plane at which planes begin at the earliest
 
+_MEASURED = 32  # images whose measured depths are looked at
+_FIRST = 0.6  # share of all points that the first image may give
+_TRUSTED = 0.5  # least confidence of a depth at which a particle begins
+_BEHIND = 0.1  # share of a distance by which what lies behind another thing is farther
+
 _PATIENCE_S = 120.0  # that the other compiling process is waited for
 
 
 def first_points(start: Start, count: int) -> Cloud:
     """Find at most about ``count`` points to begin with, and their colours.
 
-    Of the first that there is: what the stage before left; the visual hull, where images have alpha; points
-    that are known to stand still with what neighbouring views agree on; random points of the box.
+    Of the first that there is: what the stage before left; the visual hull, where images have alpha; places
+    at measured depths; points that are known to stand still with what neighbouring views agree on; random
+    points of the box.
 
     Cost: of the hull, about a second; of neighbouring views, a few.
     """
@@ -66,6 +72,8 @@ def first_points(start: Start, count: int) -> Cloud:
         cloud = left[visible] if int(visible.sum()) >= _FEW else left
     elif scene.has_alpha:
         cloud = hull_surface(scene, list(start.frames), count)
+    if cloud is None:
+        cloud = measured(scene, count)
     if cloud is None:
         cloud = swept(scene, list(start.frames), count)
     if cloud is None or len(cloud) < _FEW:
@@ -165,6 +173,58 @@ def first_values(cloud: Cloud, widest: Tensor | None = None) -> dict[str, Tensor
         "opacity": torch.zeros(len(points), 1),
         "colors": ((cloud.colors.float() - 0.5) / FLAT)[:, None].clone(),
     }
+
+
+def measured(scene: Scene, count: int) -> Cloud | None:
+    """Place points (about ``count`` of the first image) at the depths that a sensor measured; None without.
+
+    Images come in the order of their distance from the canonical time, and each adds what fills its holes, or
+    lies behind all that is there: what something moved away from. What stands before points that are there
+    already is what has moved meanwhile.
+    """
+    order = sorted(range(len(scene.train)), key=lambda i: abs(scene.train[i].time - scene.canonical_time))
+    order = [i for i in order if scene.train[i].load_sensed is not None]
+    points, colors, size = torch.zeros(0, 3), torch.zeros(0, 3), math.nan
+    for i in (order[k] for k in spread(len(order), _MEASURED)):
+        frame, camera = scene.train[i], scene.train[i].camera
+        step = max(1, round((camera.width * camera.height / (_FIRST * count)) ** 0.5))
+        rows, columns = torch.meshgrid(
+            torch.arange(step // 2, camera.height, step),
+            torch.arange(step // 2, camera.width, step),
+            indexing="ij",
+        )
+        distance, trust = frame.load_sensed()[:, rows, columns].flatten(1)
+        known = (distance > 0) & (trust >= _TRUSTED)
+        if frame.load_valid is not None:
+            known &= frame.load_valid()[rows, columns].flatten()
+        rays = camera.rays((rows * camera.width + columns).flatten()[known])
+        new, distance = rays.origins + distance[known, None] * rays.directions, distance[known]
+        added = distance > (1 + _BEHIND) * _farthest(points, new, camera, step)
+        points = torch.cat([points, new[added]])
+        colors = torch.cat(
+            [colors, frame.load()[rows, columns, :3].flatten(0, 1)[known][added].float() / 255]
+        )
+        if math.isnan(size) and len(distance):
+            size = float(distance.median()) * step / camera.fx
+    return Cloud(points, colors, torch.full((len(points),), 0.5), size) if len(points) else None
+
+
+def _farthest(points: Tensor, new: Tensor, camera: Camera, step: int) -> Tensor:
+    """Return how far the farthest of ``points`` (N, 3) is in the cell, ``step`` pixels wide, that shows each
+    of ``new`` (P, 3); 0 where there is none.
+    """
+    across = -(-camera.width // step)
+    cells = across * -(-camera.height // step)
+
+    def cells_of(places: Tensor) -> Tensor:
+        inside, row, column = _pixels(camera, places)
+        return torch.where(inside, row // step * across + column // step, cells)
+
+    far = torch.zeros(cells + 1)
+    away = (points - camera.center.to(points)).norm(dim=-1)
+    far.scatter_reduce_(0, cells_of(points), away, "amax")
+    far[cells] = 0.0
+    return far[cells_of(new)]
 
 
 def swept(scene: Scene, frames: list[int], count: int) -> Cloud | None:
@@ -341,7 +401,8 @@ def compile_kernels(method: torch.nn.Module) -> None:
         skin_weights(one, one)
         moments = zero.clone(), zero.clone(), first.clone()
         adam_rows([AdamState(torch.zeros(1, 3), torch.ones(1, 3), *moments, 1e-3)], (0.9, 0.99), 1e-15)
-    compare(*given, torch.zeros(72, 4, dtype=torch.uint8), torch.ones(3))
+    valid = torch.ones(72, dtype=torch.bool) if method.has_planes else None
+    compare(*given, torch.zeros(72, 4, dtype=torch.uint8), torch.ones(3), valid=valid)
 
 
 def compile_backward() -> None:

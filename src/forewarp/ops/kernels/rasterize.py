@@ -207,11 +207,12 @@ def _alpha(records, i, column, y):
 
 
 @njit(cache=True)
-def _blend(records, entries, first, last, column, y, kept):
+def _blend(records, entries, first, last, column, y, kept, deep):
     """Composite a tile's entries from near to far.
 
     Returns what is let through, the colour, the depth times coverage, and how many entries were looked at.
-    ``kept`` takes the alpha of each entry, and its weight; the depth is then left out. None: nothing is kept.
+    ``kept`` takes the alpha of each entry, and its weight; None: nothing is kept. The depth is left out where
+    ``deep`` is None.
     """
     through, red, green, blue, far = lanes(1.0), lanes(0.0), lanes(0.0), lanes(0.0), lanes(0.0)
     count = 0
@@ -219,9 +220,9 @@ def _blend(records, entries, first, last, column, y, kept):
         i = entries[at]
         alpha = _alpha(records, i, column, y)
         weight = alpha * through
-        if kept is None:
+        if deep is not None:
             far = fma(weight, records[i, COLUMN.depth], far)
-        else:
+        if kept is not None:
             put_row(kept, 2 * count, alpha)
             put_row(kept, 2 * count + 1, weight)
         red = fma(weight, records[i, COLUMN.red], red)
@@ -276,7 +277,7 @@ def draw(records, entries, ends, shares, out):
         for tile in range(shares[share], shares[share + 1]):
             row, column = SIDE * (tile // across), SIDE * (tile % across)
             through, red, green, blue, far, _ = _blend(
-                records, entries, ends[tile], ends[tile + 1], np.float32(column), rows() + row, None
+                records, entries, ends[tile], ends[tile + 1], np.float32(column), rows() + row, None, True
             )
             put_tile(out[0], row, column, red)
             put_tile(out[1], row, column, green)
@@ -299,7 +300,7 @@ def pull(records, entries, ends, shares, gradients, kept, sums):
                 continue
             row, column = SIDE * (tile // across), SIDE * (tile % across)
             left, y = np.float32(column), rows() + row
-            count = _blend(records, entries, first, last, left, y, kept[share])[5]
+            count = _blend(records, entries, first, last, left, y, kept[share], None)[5]
             # The last plane is what is let through: its gradient stands behind everything, times 1.
             red, green = get_tile(gradients[0], row, column), get_tile(gradients[1], row, column)
             blue, far = get_tile(gradients[2], row, column), get_tile(gradients[3], row, column)
@@ -328,30 +329,47 @@ def _score(residual, width, score):
     return residual / far
 
 
+@njit(cache=True)
+def _score_depth(error, trust, width, score):
+    """The derivative of ``trust (sqrt(e^2 + width^2) - width)``, which is added to ``score``."""
+    far = root(error * error + width * width)
+    score[2] += total(trust * (far - width))
+    return trust * error / far
+
+
 @njit(parallel=True, cache=True)
-def compare(records, entries, ends, shares, pixels, wide, high, background, width, kept, sums, scores):
+def compare(
+    records, entries, ends, shares, pixels, wide, high, background, width, planes, deep, kept, sums, scores
+):
     """Draw tiles, compare them with an image, and gather the gradients of the loss, tile by tile.
 
     The loss is the sum over pixels and channels of ``sqrt(e^2 + width^2) - width``; a tile is not looked at
-    again. ``pixels`` (H', W') uint32 are straight RGBA, of which ``high`` x ``wide`` count. Into ``scores``
-    (S, 2) go loss and squared error, into ``sums`` (S, V, 16) the gradients; what was there before is gone.
+    again. ``pixels`` (H', W') uint32 are straight RGBA, of which ``high`` x ``wide`` count. ``planes``
+    (3, H', W'), or None: 1 where a pixel counts, else 0; the inverse of a known depth; and the weight of the
+    loss of ``e = D / d + T - 1``, with D the depth times coverage, T what is let through and ``deep`` its
+    width. Into ``scores`` (S, 3) go loss, squared error and the loss of depth, into ``sums`` (S, V, 16) the
+    gradients; what was there before is gone.
     """
     across = pixels.shape[1] // SIDE
     for share in prange(len(shares) - 1):
-        score = np.zeros(2, np.float64)
+        score = np.zeros(3, np.float64)
         sums[share] = 0
         for tile in range(shares[share], shares[share + 1]):
             row, column = SIDE * (tile // across), SIDE * (tile % across)
             left, y, first = np.float32(column), rows() + row, ends[tile]
-            through, red, green, blue, _, count = _blend(
-                records, entries, first, ends[tile + 1], left, y, kept[share]
+            through, red, green, blue, far, count = _blend(
+                records, entries, first, ends[tile + 1], left, y, kept[share], planes
             )
             inside = where_above(wide - widened(narrow_columns() + left), _ZERO, lanes(1.0))
             inside = where_above(high - y, _ZERO, inside)
+            if planes is not None:
+                inside = inside * get_tile(planes[0], row, column)
             red = _residual(pixels, row, column, through, red, background[0], 0, inside)
             green = _residual(pixels, row, column, through, green, background[1], 1, inside)
             blue = _residual(pixels, row, column, through, blue, background[2], 2, inside)
-            if total(fma(red, red, fma(green, green, blue * blue))) == 0:  # which NaN is not
+            if (
+                planes is None and total(fma(red, red, fma(green, green, blue * blue))) == 0
+            ):  # which NaN is not
                 continue
             red, green, blue = (
                 _score(red, width, score),
@@ -360,5 +378,17 @@ def compare(records, entries, ends, shares, pixels, wide, high, background, widt
             )
             behind = fma(red, background[0], fma(green, background[1], blue * background[2]))
             of = (red, green, blue)
-            _walk_back(records, entries, first, count, left, y, kept[share], of, None, behind, sums[share])
-        scores[share, 0], scores[share, 1] = score[0], score[1]
+            if planes is None:
+                _walk_back(
+                    records, entries, first, count, left, y, kept[share], of, None, behind, sums[share]
+                )
+            else:
+                inverse = get_tile(planes[1], row, column)
+                error = fma(far, inverse, through) - np.float32(1)
+                by_error = _score_depth(error, get_tile(planes[2], row, column), deep, score)
+                by_far, behind = by_error * inverse, behind + by_error
+                _walk_back(
+                    records, entries, first, count, left, y, kept[share], of, by_far, behind, sums[share]
+                )
+        for number in range(3):
+            scores[share, number] = score[number]
