@@ -29,7 +29,8 @@ from forewarp.drawing.images import in_a_row, to_bytes, write_video
 from forewarp.drawing.images import read_image as read_drawn
 from forewarp.progress import Counted
 from forewarp.scene.box import Box
-from tests.support.captures import WALKS, cameras_of, pictures_of, pose_errors, smeared
+from forewarp.synth.walks import cameras_of
+from tests.support.captures import WALKS, pictures_of, pose_errors, smeared
 
 FRAMES, SECONDS, SHAKEN = 120, 8.0, 4  # every fourth frame is blurred
 GAP = 8  # pixels between pictures

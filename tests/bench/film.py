@@ -36,13 +36,15 @@ from forewarp.scene.camera import Camera
 from forewarp.scene.frame import Frame, Scene
 from forewarp.synth.movers import moving_faces, near_movers, specimen
 from forewarp.synth.raycast import Posed, camera_rays, light_points, surface_points
+from forewarp.synth.walks import Walk, cameras_of
 from forewarp.synth.world import ROOM_HIGH, ROOM_LOW, World
-from tests.support.captures import Walk, cameras_of, pose_errors
+from tests.support.captures import PHONE as LENS
+from tests.support.captures import pose_errors
 from tests.support.films import write_film
 
 TRUTH, MASKS = "truth", "moving"
 # Metres and seconds. The camera is 2.5 m from what moves; a metre there is 220 pixels.
-WALK = Walk("film", True, (-112.0, -72.0), 2.5, 14.0, (0.0, 0.05, 0.62), 44.0)
+WALK = Walk((-112.0, -72.0), 2.5, 14.0, (0.0, 0.05, 0.62), 44.0, LENS)
 BESIDE = 0.3
 GAIN, DRIFT = 0.13, 7.0  # of the exposure: share, period
 SHUTTER = 0.5  # share of the time between frames

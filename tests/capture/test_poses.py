@@ -26,7 +26,8 @@ from forewarp.capture.poses import (
 )
 from forewarp.data.directions import inverted, opposite
 from forewarp.scene.camera import Lens
-from tests.support.captures import WALKS, cameras_of, cameras_on_arc, pictures_of, sparse_arc, write_model
+from forewarp.synth.walks import cameras_of
+from tests.support.captures import WALKS, cameras_on_arc, pictures_of, sparse_arc, write_model
 
 POINTS = np.random.default_rng(0).uniform(-1, 1, (40, 3))
 LENS = (0.05, -0.02, 0.001, -0.002)

@@ -22,8 +22,9 @@ from forewarp.data.posed_video import PosedShot, read_scene, write_scene
 from forewarp.scene.box import Box
 from forewarp.synth.raycast import render
 from forewarp.synth.scenes import random_cameras
+from forewarp.synth.walks import cameras_of
 from forewarp.synth.world import World
-from tests.support.captures import WALKS, cameras_of, cameras_on_arc, pictures_of, pose_errors, write_model
+from tests.support.captures import WALKS, cameras_on_arc, pictures_of, pose_errors, write_model
 from tests.support.configs import CONF
 from tests.support.films import numbered, write_film
 

@@ -103,6 +103,7 @@ def test_bad_arguments_leave_nothing(refused, in_tmp):
         ("hypernerf", ["size=16", "frames=3"], "dataset.json"),
         ("nhr", ["size=24", "frames=2", "points=20"], "CamPose.inf"),
         ("multicam", ["size=16", "frames=2", "cameras=2"], "truth.json"),
+        ("iphone", ["size=12", "frames=2"], "dataset.json"),
     ],
 )
 def test_every_dataset_is_written_whole_and_replaced_when_told(

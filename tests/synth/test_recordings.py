@@ -1,18 +1,30 @@
-"""A rig's films show what the truth says: frames, times, masks and sound."""
+"""A rig's films show what the truth says: frames, times, masks and sound; a phone's film has its depth."""
 
 import json
 import subprocess
+from dataclasses import replace
 
 import imageio_ffmpeg
 import numpy as np
 import pytest
 import torch
 
-from forewarp.data import multicam, posed_video
+from forewarp.data import hypernerf, multicam, posed_video
 from forewarp.data.video import stamps_of
-from forewarp.synth.movers import placed_movers
-from forewarp.synth.raycast import render
-from forewarp.synth.recordings import HERTZ, LATEST, SHADOW_RAYS, hall, rig, synthesize_multicam
+from forewarp.synth.movers import SHADOW_RAYS, hall, moving_faces, placed_movers
+from forewarp.synth.raycast import Posed, camera_rays, render
+from forewarp.synth.recordings import (
+    DEPTH_ERROR,
+    FPS,
+    HERTZ,
+    KEYPOINTS,
+    LATEST,
+    REACH,
+    lidar,
+    rig,
+    synthesize_iphone,
+    synthesize_multicam,
+)
 from tests.support.films import read_film
 
 SIZE, FRAMES, CAMERAS = 64, 6, 3
@@ -130,3 +142,118 @@ def test_cameras_surround_the_movers_and_neighbours_see_alike():
                 pixels, depth = camera.project(vertices)
                 assert ((pixels > 0) & (pixels < torch.tensor([676, 506]))).all()
                 assert (depth > 0).all()
+
+
+# A phone with a LiDAR --------------------------------------------------------------------------------------
+
+FILMED, WIDE = 12, 48
+
+
+@pytest.fixture(scope="module")
+def phone(tmp_path_factory):
+    """The folder of a tiny film by a phone."""
+    root, seen = tmp_path_factory.mktemp("phone"), []
+    arguments = {"frames": FILMED, "size": WIDE, "beside": 4, "samples_per_pixel": 1, "workers": 1}
+    synthesize_iphone(root / "film", **arguments, progress=lambda *counts: seen.append(counts))
+    assert seen == [(done, FILMED + 2 * 3) for done in range(1, FILMED + 2 * 3 + 1)]
+    return root / "film"
+
+
+@pytest.fixture(scope="module")
+def capture(phone):
+    """What is read of it."""
+    return hypernerf.read_scene(phone.parent, phone.name, scale=1, depth="depth")
+
+
+def in_metres(phone, camera):
+    """A camera in the file's unit, and the reader's units for one of that."""
+    world = json.loads((phone / "scene.json").read_text())
+    pose = camera.camera_to_world.clone()
+    pose[:3, 3] = pose[:3, 3] / world["scale"] + torch.tensor(world["center"])
+    return replace(camera, camera_to_world=pose), world["scale"]
+
+
+def test_a_film_by_a_phone_reads_as_the_layout_says(phone, capture):
+    assert (len(capture.train), len(capture.test)) == (FILMED, 6)
+    assert [frame.camera_id for frame in capture.test] == [1, 1, 1, 2, 2, 2]
+    assert capture.protocol["seconds"] == pytest.approx((FILMED - 1) / FPS)
+    val = json.loads((phone / "splits" / "val.json").read_text())
+    assert val == {
+        "frame_names": [f"{k}_{t:05d}" for k in (1, 2) for t in (0, 4, 8)],
+        "time_ids": [0, 4, 8] * 2,
+        "camera_ids": [1] * 3 + [2] * 3,
+    }
+    extra = json.loads((phone / "extra.json").read_text())
+    assert {"factor", "fps", "bbox", "lookat", "up"} == {*extra}
+    assert (np.abs(extra["bbox"]) <= 0.5).all()
+    for points in (capture.still, capture.truth.points[:, 0]):
+        assert len(points) > 500
+        assert (points.abs() < 1).all()
+    paths = capture.truth.points[:, [1, -1]]
+    assert 0.02 < float((paths[:, 0] - paths[:, 1]).norm(dim=-1).max()) < 0.2
+
+
+def test_its_depth_is_true_within_the_error_but_for_the_holes(phone, capture):
+    errors = []
+    for frame in capture.train:
+        camera, scale = in_metres(phone, frame.camera)
+        _, true = render(hall((FILMED - 1) / FPS), frame.time, camera, 1, 1)
+        depth = frame.load_sensed()[0].numpy() / scale
+        there = depth > 0
+        assert 0.6 < there.mean() < 0.95
+        assert true[there].max() < REACH
+        errors.append((depth[there] / true[there] - 1).ravel())
+    assert np.concatenate(errors).std() == pytest.approx(DEPTH_ERROR, rel=0.05)
+    assert np.abs(np.concatenate(errors).mean()) < 5e-4
+
+
+def test_a_lidar_has_holes_at_edges_and_beyond_its_reach():
+    camera = rig(2, 64, 0)[0]
+    distance = np.full((camera.height, camera.width), 2.0)
+    distance[:, 40:] = 3.0
+    distance[:8] = REACH + 0.1
+    depth = lidar(camera, distance, np.random.default_rng(0))
+    assert not depth[:8].any()
+    assert not depth[:, 39:41].any()
+    assert 0.9 < (depth[10:] > 0).mean() < 1
+
+
+def test_covisible_pixels_are_those_that_enough_images_show(phone, capture):
+    """By the images' true depth maps, another way than rays to the points."""
+    world = hall((FILMED - 1) / FPS)
+    train = [(frame.time, in_metres(phone, frame.camera)[0]) for frame in capture.train]
+    maps = [render(world, time, camera, 1, 1)[1] for time, camera in train]
+    for frame in capture.test[1::3]:
+        camera, _ = in_metres(phone, frame.camera)
+        hits = Posed(world, frame.time).first_hits(*camera_rays(camera))
+        counts = np.zeros(len(hits.face))
+        for (time, taker), depth in zip(train, maps):
+            points = torch.from_numpy(world.points(hits.face, hits.barycentric, time))
+            pixel, along = taker.project(points)
+            column, row = pixel.floor().long().unbind(-1)
+            inside = (column >= 0) & (column < WIDE) & (row >= 0) & (row < depth.shape[0]) & (along > 0)
+            rows = np.flatnonzero(inside)
+            distance = (points[rows] - taker.center).norm(dim=-1).numpy()
+            counts[rows] += np.abs(depth[row[rows], column[rows]] - distance) < 0.05 * distance
+        covisible = frame.load_covisible().numpy().ravel()
+        assert 0.4 < covisible.mean() < 0.95
+        assert (covisible == (counts > 5)).mean() > 0.97
+        assert moving_faces(world)[hits.face[covisible]].any()
+
+
+def test_keypoints_follow_the_movers(phone, capture):
+    marked = [frame for frame in capture.train if frame.keypoints is not None]
+    moments = np.linspace(0, FILMED, 10, endpoint=False).astype(int)
+    assert [frame.name for frame in marked] == [f"0_{moment:05d}" for moment in moments]
+    world = hall((FILMED - 1) / FPS)
+    for frame in marked:
+        assert len(frame.keypoints) == KEYPOINTS
+        seen = frame.keypoints[:, 2] == 1
+        assert seen.sum() > 3
+        assert not frame.keypoints[~seen].any()
+        camera, _ = in_metres(phone, frame.camera)
+        hits = Posed(world, frame.time).first_hits(*camera_rays(camera))
+        moving = moving_faces(world)[hits.face].reshape(camera.height, camera.width)
+        centers = np.argwhere(moving)[:, ::-1] + 0.5
+        away = np.abs(frame.keypoints[seen, None, :2].numpy() - centers).max(-1).min(1)
+        assert away.max() < 1  # a pixel's centre may lie beside a point that it shows

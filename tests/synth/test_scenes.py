@@ -22,6 +22,7 @@ TINY = {
     "hypernerf": {"size": 16, "frames": 3},
     "nhr": {"size": 24, "frames": 2, "points": 30},
     "multicam": {"size": 16, "frames": 2, "cameras": 2},
+    "iphone": {"size": 12, "frames": 2},
 }
 BAD = [
     ("dnerf", {"size": 7}, "size: expected a whole number of at least 8, but got 7"),
@@ -41,6 +42,8 @@ BAD = [
     ("nhr", {"size": 100}, "size: expected a multiple of 24 of at least 24, but got 100; set size"),
     ("multicam", {"size": 65}, "size: expected a multiple of 2 of at least 16, but got 65; set size"),
     ("multicam", {"cameras": 1}, "cameras: expected a whole number of at least 2, but got 1; set cameras"),
+    ("iphone", {"size": 32}, "size: expected a multiple of 6 of at least 12, but got 32; set size"),
+    ("iphone", {"beside": 0}, "beside: expected a whole number of at least 1, but got 0; set beside"),
     ("multicam", {"synchronised": "yes"}, "synchronised: expected true or false, but got 'yes'"),
 ]
 

@@ -16,6 +16,8 @@ What one types most:
           nhr            20 cameras of two image sizes around it: masks, point clouds
           multicam       two movers in a room: videos by cameras=12 that begin apart, with a clap;
                          truth/ for experiment=video_with_poses; synchronised=true for experiment=multicam
+          iphone         the same by a hand-held phone with a LiDAR, for experiment=iphone: co-visible pixels,
+                         keypoints, two phones beside its path (beside=5: with every fifth frame)
   folder=FOLDER          the scene's own folder
   size=N frames=N seed=N pixels, times, random cameras
   motion=lift|lift_tilt|drive      how it moves; motions=[...] for lego_complete

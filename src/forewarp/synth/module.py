@@ -28,6 +28,7 @@ WRITERS = {
     "hypernerf": scenes.synthesize_hypernerf,
     "nhr": scenes.synthesize_nhr,
     "multicam": recordings.synthesize_multicam,
+    "iphone": recordings.synthesize_iphone,
 }
 
 

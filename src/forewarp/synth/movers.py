@@ -1,20 +1,52 @@
-"""Two movers in a room, for films: a box slides and turns on a bench, a ball bounces. Metres and seconds."""
+"""Two movers in a room, for films: a box slides and turns on a bench, a ball bounces. Metres and seconds.
+
+Cameras that stand still film cheaply: the room without movers is rendered once, then only what they and their
+shadows touch.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
+from functools import lru_cache
 
 import numpy as np
 import torch
 
+from forewarp.ops.backend import cores
 from forewarp.scene.camera import Camera
+from forewarp.synth.raycast import (
+    LIGHT_RADIUS,
+    SAMPLES_A_PROCESS,
+    Posed,
+    by_processes,
+    camera_rays,
+    shaded,
+    surface_points,
+)
 from forewarp.synth.shapes import Material, Part, box, sphere
 from forewarp.synth.vehicle import rotation, shift
-from forewarp.synth.world import INK, LACQUER, ROOM_LOW, STONES, TILES, Specimen, World
+from forewarp.synth.world import (
+    INK,
+    LACQUER,
+    LIGHT_AT,
+    ROOM_HIGH,
+    ROOM_LOW,
+    STONES,
+    TILES,
+    Specimen,
+    World,
+    room,
+)
 
 MOVERS = ("box", "ball")
 RADIUS, BOUNCE, GRAVITY = 0.15, 0.36, 9.81  # of the ball, how high it bounces
+HALL_LOW, HALL_HIGH = (-3.2, -3.7, ROOM_LOW[2]), (3.2, ROOM_HIGH[1], ROOM_HIGH[2])
+FINENESS = 1.8  # tiles of the hall: 20 to 30 pixels wide, so that there are corners to match everywhere
+SHADOW_RAYS = 2  # a sample; eight lights a pixel
 _PAD = 4  # pixels around what moves
+_TOUCHED = 0.06  # of an image, about
+_SAME = 2e-3  # metres by which a ray may miss a point that it shows
 
 
 def specimen(seconds: float, extra=list) -> Specimen:
@@ -87,3 +119,141 @@ def placed_movers(world: World, time: float) -> dict[str, np.ndarray]:
         for part in world.parts
         if part.name in MOVERS
     }
+
+
+@lru_cache(4)
+def hall(seconds: float, has_movers: bool = True) -> World:
+    """Make the room with or without its movers; times from 0 to 1 last ``seconds``."""
+    subject = specimen(seconds, lambda: room(HALL_LOW, HALL_HIGH, FINENESS))
+    return World(subject if has_movers else replace(subject, absent=lambda time: MOVERS))
+
+
+class Film:
+    """Frames of a fixed camera, of which only what differs from the still image (H, W, 3) uint8 is kept."""
+
+    def __init__(self, still: np.ndarray) -> None:
+        self.still, self.changes = still, []
+
+    def add(
+        self, pixels: np.ndarray, colors: np.ndarray, is_mover: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Add a frame; return it, and bool (H, W), what moves.
+
+        Args:
+            pixels: (n,) numbers of those that may differ.
+            colors: (n, 3) uint8.
+            is_mover: (n,) bool.
+        """
+        self.changes.append((pixels.astype(np.int32), colors))
+        moving = np.zeros(self.still.shape[:2], bool)
+        moving.flat[pixels[is_mover]] = True
+        return self._changed(pixels, colors), moving
+
+    def _changed(self, pixels: np.ndarray, colors: np.ndarray) -> np.ndarray:
+        image = self.still.copy()
+        image.reshape(-1, 3)[pixels] = colors
+        return image
+
+    def __iter__(self) -> Iterator[np.ndarray]:
+        return (self._changed(*change) for change in self.changes)
+
+
+def filmed(
+    views: Sequence[Camera],
+    times: Sequence[Sequence[float]],
+    seconds: float,
+    samples: int,
+    workers: int | None,
+) -> Iterator:
+    """Yield of each fixed camera what ``Film`` takes, then of each of its frames what ``Film.add`` takes.
+
+    Args:
+        times: of each camera, in [0, 1].
+        seconds: of the ``hall``.
+        samples, workers: see ``raycast.render_all``.
+    """
+
+    def jobs():
+        for view, of_view in zip(views, times):
+            touched = Touched(view, seconds)
+            yield seconds, None, view, samples, None
+            for time in of_view:
+                yield seconds, time, view, samples, touched(time)
+
+    pixels = sum(v.width * v.height * (1 + _TOUCHED * len(of_view)) for v, of_view in zip(views, times))
+    workers = workers or max(1, min(cores(), int(pixels * samples / SAMPLES_A_PROCESS)))
+    return by_processes(_shade, jobs(), workers)
+
+
+def _shade(seconds: float, time: float | None, view: Camera, samples: int, pixels: np.ndarray | None):
+    """Shade the still image (H, W, 3) where time is None; else pixels, colours, and which are movers'."""
+    world = hall(seconds, has_movers=time is not None)
+    posed = Posed(world, time or 0.0)
+    rgb = np.rint(255 * shaded(posed, view, samples, SHADOW_RAYS, pixels)[0]).astype(np.uint8)
+    if time is None:
+        return rgb.reshape(view.height, view.width, 3)
+    hits, moving = posed.first_hits(*camera_rays(view, pixels=pixels)), np.zeros(len(pixels), bool)
+    moving[hits.ray] = moving_faces(world)[hits.face]
+    return pixels, rgb, moving
+
+
+class Touched:
+    """Find the pixels of a fixed camera that movers or their shadows can touch: a few more than do."""
+
+    def __init__(self, camera: Camera, seconds: float) -> None:
+        self.camera, self.world = camera, hall(seconds)
+        origins, directions = camera_rays(camera)
+        hits = Posed(hall(seconds, has_movers=False), 0.0).first_hits(origins, directions)
+        points = np.full(origins.shape, np.inf, np.float32)
+        points[hits.ray] = origins[hits.ray] + hits.distance[:, None] * directions[hits.ray]
+        self.points, self.to_light = points, LIGHT_AT.astype(np.float32) - points
+        self.length = np.linalg.norm(self.to_light, axis=-1)
+
+    def __call__(self, time: float) -> np.ndarray:
+        """Return the numbers (n,) of the pixels at a time."""
+        touched = near_movers(self.world, [time], [self.camera]).ravel()
+        for vertices in placed_movers(self.world, time).values():
+            center = 0.5 * (vertices.min(0) + vertices.max(0))
+            radius = np.linalg.norm(vertices - center, axis=-1).max() + 0.02
+            # A cone from a point to the light's disc meets the sphere around the mover.
+            away = center.astype(np.float32) - self.points
+            along = np.einsum("nd,nd->n", away, self.to_light) / self.length
+            aside = np.sqrt(np.maximum(np.einsum("nd,nd->n", away, away) - along**2, 0))
+            share = along / self.length
+            touched |= (along > -radius) & (aside < radius + LIGHT_RADIUS * share.clip(0, 1))
+        return np.flatnonzero(touched)
+
+
+def still_points(world: World, cameras: Sequence[Camera], rng: np.random.Generator, count: int) -> np.ndarray:
+    """Draw ``count`` points of what stands still, less those (N, 3) that no camera sees at time 0."""
+    drawn = surface_points(world, count, list(cameras), rng, among=~moving_faces(world))
+    return world.points(*drawn, 0.0)[views_of(world, [0.0] * len(cameras), cameras, *drawn) > 0]
+
+
+def views_of(
+    world: World,
+    times: Sequence[float],
+    cameras: Sequence[Camera],
+    face: np.ndarray,
+    barycentric: np.ndarray,
+) -> np.ndarray:
+    """Count the images (N,) that show surface points, which move with what they lie on.
+
+    Args:
+        times, cameras: of the images.
+        face, barycentric: (N,) and (N, 3), the points; see ``World.points``.
+
+    **Cost** a ray for each point and each image within whose rectangle it falls.
+    """
+    counts = np.zeros(len(face), np.int64)
+    for time, camera in zip(times, cameras):
+        points, center = world.points(face, barycentric, time), camera.center.double().numpy()
+        pixel, depth = (values.numpy() for values in camera.project(torch.from_numpy(points)))
+        rows = np.flatnonzero(
+            (depth > 0) & (pixel >= 0).all(-1) & (pixel < (camera.width, camera.height)).all(-1)
+        )
+        away = points[rows] - center
+        distance = np.linalg.norm(away, axis=-1)
+        hits = Posed(world, time).first_hits(np.broadcast_to(center, away.shape), away / distance[:, None])
+        counts[rows[hits.ray]] += np.abs(hits.distance - distance[hits.ray]) < _SAME
+    return counts

@@ -1,19 +1,20 @@
-"""Films of two movers in a room, with their truth: by a rig of fixed cameras."""
+"""Films of two movers in a room, with their truth: by a rig of fixed cameras, and by a phone with a LiDAR."""
 
 from __future__ import annotations
 
 import math
 import wave
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
-from functools import lru_cache
+from contextlib import closing
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import torch
 
-from forewarp.data import posed_video
+from forewarp.data import hypernerf, posed_video
 from forewarp.data.files import mismatch, remove, whole
+from forewarp.data.hypernerf import RigShot
 from forewarp.data.multicam import write_poses
 from forewarp.data.posed_video import PosedShot
 from forewarp.drawing.images import write_video
@@ -21,40 +22,50 @@ from forewarp.files import write_json
 from forewarp.ops.backend import cores
 from forewarp.scene.box import Box
 from forewarp.scene.camera import Camera, look_at
-from forewarp.synth.movers import MOVERS, moving_faces, near_movers, placed_movers, specimen
+from forewarp.scene.frame import middle_of
+from forewarp.synth.movers import (
+    HALL_HIGH,
+    HALL_LOW,
+    SHADOW_RAYS,
+    Film,
+    filmed,
+    hall,
+    moving_faces,
+    still_points,
+    views_of,
+)
 from forewarp.synth.raycast import (
-    LIGHT_RADIUS,
     SAMPLES_A_PROCESS,
     Posed,
     by_processes,
     camera_rays,
-    shaded,
+    render,
     surface_points,
 )
 from forewarp.synth.scenes import UP, check_numbers
-from forewarp.synth.world import LIGHT_AT, ROOM_HIGH, ROOM_LOW, World, room
+from forewarp.synth.walks import Walk, cameras_of, direction
+from forewarp.synth.world import World
 
 TRUTH = "truth"  # the folder, and the file's stem
-HALL_LOW, HALL_HIGH = (-3.2, -3.7, ROOM_LOW[2]), (3.2, ROOM_HIGH[1], ROOM_HIGH[2])
-FINENESS = 1.8  # tiles of the hall: 20 to 30 pixels wide, so that there are corners to match everywhere
 # The rig's arc, degrees from x towards y, and metres.
 MIDDLE, STEP, MOST_ARC = -90.0, 12.5, 165.0
 DISTANCE, HEIGHTS, FOCUS, VIEW_ANGLE = 2.75, (1.0, 1.4), (0.0, 0.0, 0.5), 60.0
 RATES = (29.97, 30.0)  # frames a second, in turns
 LATEST, LATEST_SHARE = 0.5, 0.3  # the most by which a camera begins late: seconds, share of its recording
 NEAR, FAR = 0.5, 8.0
-SHADOW_RAYS = 2  # a sample; eight lights a pixel
 POINTS = 4000  # drawn of what stands still
 # Sound: of the clap a few damped tones, hertz and seconds; its and the noise's loudness.
 HERTZ, TONES, FADE, LOUD, NOISE = 48000, (610.0, 1130.0, 1870.0, 2950.0, 4700.0), 0.012, 0.7, 0.01
-_LENSES, _OFFSETS, _SOUNDS, _DRAWN = 20, 21, 22, 23  # streams of random numbers
-
-
-@lru_cache(4)
-def hall(seconds: float, has_movers: bool = True) -> World:
-    """Make the room with or without its movers; times from 0 to 1 last ``seconds``."""
-    subject = specimen(seconds, lambda: room(HALL_LOW, HALL_HIGH, FINENESS))
-    return World(subject if has_movers else replace(subject, absent=lambda time: MOVERS))
+# The phone: its walk, and where others stand, degrees from x towards y and above the ground.
+FPS, WALK = 30.0, Walk((-106.0, -78.0), 2.5, 14.0, (0.0, 0.05, 0.62), 50.0)
+BESIDE = ((-118.0, 20.0), (-66.0, 9.0))
+# Its LiDAR: relative error, pixels with one error, metres, relative step that is an edge, patches without
+# depth in an image and their greatest radius in widths.
+DEPTH_ERROR, BLOCK, REACH, EDGE, PATCHES, PATCH = 0.01, 2, 5.0, 0.05, 3, 0.08
+LEAST_VIEWS, LEAST_SHARE = 5, 0.1  # of the training images: a co-visible pixel is seen in more
+TRACKS, KEYPOINTS, MARKED = 4000, 8, 10  # points followed; points marked, in how many training images
+# Streams of random numbers.
+_LENSES, _OFFSETS, _SOUNDS, _DRAWN, _TRACKS, _KEYS, _LIDAR = range(20, 27)
 
 
 def synthesize_multicam(
@@ -107,15 +118,14 @@ def synthesize_multicam(
     remove(folder, f"{TRUTH}.json", "cam*.mp4", "poses_bounds.npy")
 
     def shots() -> Iterator[PosedShot]:
-        images, done = _filmed(views, clocks, seconds, samples_per_pixel, workers), 0
+        times, done = [[time / seconds for time in clock.times] for clock in clocks], 0
+        images = filmed(views, times, seconds, samples_per_pixel, workers)
         for k, (view, clock) in enumerate(zip(views, clocks)):
             name, film = f"cam{k:02d}", Film(next(images))
-            for number, time in enumerate(clock.times):
-                pixels, colors, is_mover = next(images)
-                moving = np.zeros((view.height, view.width), bool)
-                moving.flat[pixels[is_mover]] = True
-                shot, image = f"{name}_{number:04d}.jpg", film.add(pixels, colors)
-                yield PosedShot(shot, view, image, time / seconds, moving=moving, taken_by=name)
+            for number, time in enumerate(times[k]):
+                image, moving = film.add(*next(images))
+                shot = f"{name}_{number:04d}.jpg"
+                yield PosedShot(shot, view, image, time, moving=moving, taken_by=name)
                 done += 1
                 if progress is not None:
                     progress(done, cameras * frames)
@@ -125,12 +135,9 @@ def synthesize_multicam(
             write_video(folder / f"{name}.mp4", frames_of_film, fps=clock.rate, sound=sound)
             sound.unlink()
 
-    world, box = hall(seconds), Box(HALL_LOW, HALL_HIGH)
-    drawn = surface_points(
-        world, POINTS, views, np.random.default_rng([seed, _DRAWN]), among=~moving_faces(world)
-    )
-    told = {"seconds": seconds, "moving_from": "the program that made the film"}
-    limits = {"near": NEAR, "far": FAR, "aabb": box, "points": world.points(*drawn, 0.0)}
+    points = still_points(hall(seconds), views, np.random.default_rng([seed, _DRAWN]), POINTS)
+    told = {"seconds": seconds, "moving_from": "the program that made the film", "points": points}
+    limits = {"near": NEAR, "far": FAR, "aabb": Box(HALL_LOW, HALL_HIGH)}
     posed_video.write_scene(folder / TRUTH, shots(), **limits, **told)
     if synchronised:
         write_poses(folder, views, near=NEAR, far=FAR)
@@ -192,80 +199,6 @@ def _told(camera: Camera) -> dict:
     return inner | {"camera_to_world": camera.camera_to_world.tolist()}
 
 
-class Film:
-    """Frames of a fixed camera, of which only what differs from the still image (H, W, 3) uint8 is kept."""
-
-    def __init__(self, still: np.ndarray) -> None:
-        self.still, self.changes = still, []
-
-    def add(self, pixels: np.ndarray, colors: np.ndarray) -> np.ndarray:
-        """Add a frame by its ``pixels`` (n,) that may have other ``colors`` (n, 3) uint8, and return it."""
-        self.changes.append((pixels.astype(np.int32), colors))
-        return self._changed(pixels, colors)
-
-    def _changed(self, pixels: np.ndarray, colors: np.ndarray) -> np.ndarray:
-        image = self.still.copy()
-        image.reshape(-1, 3)[pixels] = colors
-        return image
-
-    def __iter__(self) -> Iterator[np.ndarray]:
-        return (self._changed(*change) for change in self.changes)
-
-
-def _filmed(views, clocks, seconds: float, samples: int, workers: int | None) -> Iterator:
-    """Yield of each camera the still image, then its frames; see ``_shade``."""
-
-    def jobs():
-        for view, clock in zip(views, clocks):
-            touched = Touched(view, seconds)
-            yield seconds, None, view, samples, None
-            for time in clock.times:
-                yield seconds, time / seconds, view, samples, touched(time / seconds)
-
-    rays = samples * sum(view.width * view.height * (1 + 0.06 * c.frames) for view, c in zip(views, clocks))
-    workers = workers or max(1, min(cores(), int(rays / SAMPLES_A_PROCESS)))
-    return by_processes(_shade, jobs(), workers)
-
-
-def _shade(seconds: float, time: float | None, view: Camera, samples: int, pixels: np.ndarray | None):
-    """Shade the still image (H, W, 3) where time is None; else pixels, colours, and which are movers'."""
-    world = hall(seconds, has_movers=time is not None)
-    posed = Posed(world, time or 0.0)
-    rgb = np.rint(255 * shaded(posed, view, samples, SHADOW_RAYS, pixels)[0]).astype(np.uint8)
-    if time is None:
-        return rgb.reshape(view.height, view.width, 3)
-    hits, moving = posed.first_hits(*camera_rays(view, pixels=pixels)), np.zeros(len(pixels), bool)
-    moving[hits.ray] = moving_faces(world)[hits.face]
-    return pixels, rgb, moving
-
-
-class Touched:
-    """Find the pixels of a fixed camera that movers or their shadows can touch: a few more than do."""
-
-    def __init__(self, camera: Camera, seconds: float) -> None:
-        self.camera, self.world = camera, hall(seconds)
-        origins, directions = camera_rays(camera)
-        hits = Posed(hall(seconds, has_movers=False), 0.0).first_hits(origins, directions)
-        points = np.full(origins.shape, np.inf, np.float32)
-        points[hits.ray] = origins[hits.ray] + hits.distance[:, None] * directions[hits.ray]
-        self.points, self.to_light = points, LIGHT_AT.astype(np.float32) - points
-        self.length = np.linalg.norm(self.to_light, axis=-1)
-
-    def __call__(self, time: float) -> np.ndarray:
-        """Return the numbers (n,) of the pixels at a time."""
-        touched = near_movers(self.world, [time], [self.camera]).ravel()
-        for vertices in placed_movers(self.world, time).values():
-            center = 0.5 * (vertices.min(0) + vertices.max(0))
-            radius = np.linalg.norm(vertices - center, axis=-1).max() + 0.02
-            # A cone from a point to the light's disc meets the sphere around the mover.
-            away = center.astype(np.float32) - self.points
-            along = np.einsum("nd,nd->n", away, self.to_light) / self.length
-            aside = np.sqrt(np.maximum(np.einsum("nd,nd->n", away, away) - along**2, 0))
-            share = along / self.length
-            touched |= (along > -radius) & (aside < radius + LIGHT_RADIUS * share.clip(0, 1))
-        return np.flatnonzero(touched)
-
-
 def write_sound(path: Path, clock: Clock, clap: float, rng: np.random.Generator) -> None:
     """Write what a camera hears as WAV: noise of its own, and the clap at ``clap`` seconds for all."""
     since = clock.offset + np.arange(round(clock.frames / clock.rate * HERTZ)) / HERTZ - clap
@@ -278,3 +211,178 @@ def write_sound(path: Path, clock: Clock, clap: float, rng: np.random.Generator)
         file.setsampwidth(2)
         file.setframerate(HERTZ)
         file.writeframes((32767 * samples.clip(-1, 1)).astype("<i2").tobytes())
+
+
+def synthesize_iphone(
+    folder: str | Path,
+    *,
+    frames: int = 100,
+    size: int = 360,
+    beside: int = 5,
+    seed: int = 0,
+    samples_per_pixel: int = 4,
+    workers: int | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> Path:
+    """Write what a phone with a LiDAR films, held by hand, into ``folder``, and return that folder.
+
+    The layout is dycheck's, which ``hypernerf.read_scene`` reads; the world's unit is the metre. Depth lies
+    along the optical axis, with an error of 1 % and holes: far away, at edges and in patches. Two phones that
+    stand beside the path take the validation images. Their co-visible pixels show what more training images
+    show than 5 and than a tenth of them, wherever it has moved meanwhile: exactly, by rays. Of ten training
+    images the keypoints are known, points on the movers; trajectories follow 4000 points, the middle first.
+
+    Args:
+        folder: folder of the capture; an existing one is replaced.
+        frames: of the film, at 30 a second, at least 2.
+        size: pixels of the width, a multiple of 6; the height is 4/3 of it.
+        beside: a validation image of each phone is taken with every n-th frame.
+        seed: draws sway, noise, holes and points.
+        samples_per_pixel: rays averaged into a pixel.
+        workers: processes; see ``raycast.render_all``.
+        progress: called with (images done, all images) after each.
+
+    Raises:
+        SceneError: for a bad argument; ImportError: without ``forewarp[synth]``.
+
+    **Cost** every training image in whole; then for each of them a ray to every co-visible candidate.
+    """
+    folder, numbers = Path(folder), {"frames": (frames, 2), "beside": (beside, 1), "seed": (seed, 0)}
+    check_numbers(samples_per_pixel, workers, **numbers)
+    whole(size, "size", 12, multiple=6)
+    seconds, times = (frames - 1) / FPS, np.linspace(0, 1, frames).tolist()
+    world, shape = hall(seconds), (size, size * 4 // 3)
+    cameras = cameras_of(WALK, times, seconds, shape, seed)
+    phones = [_phone_beside(*place, shape) for place in BESIDE]
+    moments = [*range(0, frames, beside)]
+    total, middle = frames + len(phones) * len(moments), middle_of(times)
+    drawn = {
+        kind: surface_points(
+            world, count, cameras[:: max(1, frames // 8)], _stream(seed, place), middle, among
+        )
+        for kind, (count, place, among) in {
+            "tracks": (TRACKS, _TRACKS, world.casts),
+            "keypoints": (KEYPOINTS, _KEYS, moving_faces(world)),
+        }.items()
+    }
+
+    def shots() -> Iterator[RigShot]:
+        rays = size * shape[1] * frames * samples_per_pixel
+        processes = workers or max(1, min(cores(), int(rays / SAMPLES_A_PROCESS)))
+        jobs = ((seconds, time, camera, samples_per_pixel) for time, camera in zip(times, cameras))
+        chosen = {*np.linspace(0, frames, min(frames, MARKED), endpoint=False).astype(int).tolist()}
+        for t, (rgb, distance) in enumerate(by_processes(_whole, jobs, processes)):
+            depth, keypoints = lidar(cameras[t], distance, _stream(seed, _LIDAR, t)), None
+            if t in chosen:
+                keypoints = _keypoints(world, times[t], cameras[t], *drawn["keypoints"])
+            yield RigShot(f"0_{t:05d}", t, 0, "train", cameras[t], rgb, depth=depth, keypoints=keypoints)
+            if progress is not None:
+                progress(t + 1, total)
+        of_phones = [[times[t] for t in moments]] * len(phones)
+        images, done = filmed(phones, of_phones, seconds, samples_per_pixel, workers), frames
+        for k, phone in enumerate(phones, 1):
+            film, still = Film(next(images)), _seen_by(hall(seconds, has_movers=False), 0.0, phone)
+            counts = views_of(world, times, cameras, *still).reshape(shape[::-1])
+            for t in moments:
+                rgb, moving = film.add(*next(images))
+                counted = counts.copy()
+                surface = _seen_by(world, times[t], phone, np.flatnonzero(moving))
+                counted[moving] = views_of(world, times, cameras, *surface)
+                covisible = counted > max(LEAST_VIEWS, int(LEAST_SHARE * frames))
+                yield RigShot(f"{k}_{t:05d}", t, k, "val", phone, rgb, covisible=covisible)
+                done += 1
+                if progress is not None:
+                    progress(done, total)
+
+    low, high, near, far = _space_of(world, times, cameras)
+    center, scale = 0.5 * (low + high), 1 / float(np.linalg.norm(high - low))
+    points = still_points(world, cameras[:: max(1, frames // 8)], _stream(seed, _DRAWN), POINTS)
+    order = [middle, *(time for time in times if time != middle)]
+    truth = world.trajectories(*drawn["tracks"], np.array(order))
+    limits = {"center": center.tolist(), "scale": scale, "near": scale * near, "far": scale * far}
+    with closing(shots()) as made:
+        hypernerf.write_scene(folder, made, **limits, points=points, trajectories=truth)
+    ids = {0: [*range(frames)]} | {k: moments for k in range(1, len(phones) + 1)}
+    for split, takers in (("train", [0]), ("val", [*ids][1:])):
+        pairs = [(k, t) for k in takers for t in ids[k]]
+        names = {"frame_names": [f"{k}_{t:05d}" for k, t in pairs]}
+        told = names | {"time_ids": [t for _, t in pairs], "camera_ids": [k for k, _ in pairs]}
+        write_json(folder / "splits" / f"{split}.json", told)
+    box, look = scale * (np.stack([low, high]) - center), scale * (np.array(WALK.focus) - center)
+    extra = {"factor": 2, "fps": FPS, "bbox": box.tolist(), "lookat": look.tolist(), "up": UP.tolist()}
+    write_json(folder / "extra.json", extra)
+    skeleton = {"name": "unconnected", "parents": [None] * KEYPOINTS}
+    skeleton["kp_names"] = [f"KP_{number}" for number in range(KEYPOINTS)]
+    for factor in (1, 2):
+        write_json(folder / "keypoint" / f"{factor}x" / "train" / "skeleton.json", skeleton)
+    return folder
+
+
+def _stream(*seeds: int) -> np.random.Generator:
+    return np.random.default_rng(seeds)
+
+
+def _phone_beside(azimuth: float, rise: float, shape: tuple[int, int]) -> Camera:
+    """Place a phone that stands still, by degrees, which looks at the walk's focus."""
+    center = np.array(WALK.focus) + WALK.radius * direction(math.radians(azimuth), math.radians(rise))
+    pose = look_at(torch.from_numpy(center), torch.tensor(WALK.focus), UP)
+    (width, height), focal = shape, 0.5 * shape[0] / math.tan(0.5 * math.radians(WALK.angle))
+    return Camera(width, height, focal, focal, width / 2, height / 2, pose, NEAR, FAR)
+
+
+def _whole(seconds: float, time: float, camera: Camera, samples: int) -> tuple[np.ndarray, np.ndarray]:
+    """Do a job: the image (H, W, 3) uint8, and distances (H, W) along the rays."""
+    rgba, distance = render(hall(seconds), time, camera, samples, SHADOW_RAYS)
+    return rgba[..., :3], distance
+
+
+def _seen_by(world: World, time: float, camera: Camera, pixels: np.ndarray | None = None):
+    """Find the surface points that pixels show: faces (N,) and barycentric coordinates (N, 3)."""
+    hits = Posed(world, time).first_hits(*camera_rays(camera, pixels=pixels))
+    return hits.face, hits.barycentric
+
+
+def _keypoints(world: World, time: float, camera: Camera, face, barycentric) -> np.ndarray:
+    """Project points at a time: rows (J, 3) of x, y and 1, or of zeros where something hides it."""
+    pixel, _ = camera.project(torch.from_numpy(world.points(face, barycentric, time)))
+    seen = views_of(world, [time], [camera], face, barycentric)[:, None]
+    return np.concatenate([pixel.numpy() * seen, seen], -1)
+
+
+def lidar(camera: Camera, distance: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Measure depth as a phone does: along the optical axis, float32 (H, W), 0 in holes.
+
+    Args:
+        distance: (H, W), the true ones along the rays.
+        rng: draws the error, in blocks as the sensor is coarser than the image, and patches without depth.
+    """
+    height, width = distance.shape
+    axis = camera.camera_to_world[:3, 2].numpy()
+    true = distance * (camera_rays(camera)[1] @ axis).reshape(distance.shape)
+    coarse = rng.normal(size=(-(-height // BLOCK), -(-width // BLOCK)))
+    error = np.kron(coarse, np.ones((BLOCK, BLOCK)))[:height, :width]
+    hole = distance > REACH
+    for ahead in (np.s_[1:, :], np.s_[:-1, :]), (np.s_[:, 1:], np.s_[:, :-1]):
+        one, other = (true[part] for part in ahead)
+        for part in ahead:
+            hole[part] |= np.abs(one - other) > EDGE * np.minimum(one, other)
+    rows, columns = np.mgrid[:height, :width]
+    for _ in range(PATCHES):
+        row, column, radius = rng.uniform(0, (height, width, PATCH * width))
+        hole |= np.hypot(rows - row, columns - column) < radius
+    return np.where(hole, 0, true * (1 + DEPTH_ERROR * error)).astype(np.float32)
+
+
+def _space_of(world: World, times, cameras) -> tuple[np.ndarray, np.ndarray, float, float]:
+    """Find the box of what the film shows within the LiDAR's reach, with the cameras; near and far as in
+    dycheck's captures: three quarters of the nearest distance, five quarters of the farthest.
+    """
+    places, distances = [np.stack([camera.center.numpy() for camera in cameras])], []
+    for time, camera in [*zip(times, cameras)][:: max(1, len(cameras) // 10)]:
+        origins, directions = camera_rays(camera.resized(24, 32))
+        hits = Posed(world, time).first_hits(origins, directions)
+        distances.append(hits.distance)
+        point = origins[hits.ray] + hits.distance[:, None] * directions[hits.ray]
+        places.append(point[hits.distance < REACH])
+    place, distance = np.concatenate(places), np.concatenate(distances)
+    return place.min(0), place.max(0), 0.75 * distance.min(), 1.25 * distance.max()
