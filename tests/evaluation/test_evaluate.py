@@ -9,7 +9,15 @@ import torch
 from forewarp.data.batches import Targets, color_of
 from forewarp.data.module import SceneDataModule
 from forewarp.evaluation import evaluate as evaluation
-from forewarp.evaluation.evaluate import draw, evaluate, flow_error, reduced_rendering, show, without
+from forewarp.evaluation.evaluate import (
+    draw,
+    evaluate,
+    flow_error,
+    keypoint_transfer,
+    reduced_rendering,
+    show,
+    without,
+)
 from forewarp.methods.voxel.model import VoxelSnapshot
 from forewarp.metrics.registry import LPIPS_METRICS, ImageSuite
 from forewarp.scene.camera import joined
@@ -147,6 +155,33 @@ def test_flow_is_measured_against_the_truth(run, module):
     predicted = module.method.trajectories(points[:, 0], torch.tensor([0.0, 1.0])).detach()
     error = float((predicted - drifting)[:, 1].norm(dim=-1).mean())
     assert (flow["epe_moving"], flow["motion_mean"]) == pytest.approx((error, 0.5), rel=1e-5)
+
+
+def test_keypoints_are_carried_between_all_pairs_of_frames(run, module, monkeypatch):
+    """Of pixels that stay at depth 3 of the first camera but for one, and a frame that sees only that one."""
+    scene, shown = run.datamodule.scene, []
+    camera = scene.train[0].camera  # of 24 pixels: 5 % are 1.2
+    assert keypoint_transfer(module, scene) is None
+    points = torch.tensor([[5.5, 9.5, 1.0], [20.5, 3.5, 1.0], [2.0, 2.0, 0.0]])
+    moved = points + torch.tensor([[1.0, 0, 0], [3, 0, 0], [0, 0, 0]])
+    alone = points * torch.tensor([1.0, 1.0, 0.0])
+    alone[2] = torch.tensor([4.0, 4, 1])
+    keypoints = [points, moved, alone]
+    train = [replace(f, camera=camera, keypoints=k) for f, k in zip(scene.train, keypoints)]
+    scene = replace(scene, train=(*train, *scene.train[3:]))
+    assert keypoint_transfer(module, scene) is None  # the method carries none
+
+    def carried(view, moment, to):
+        shown.append((moment.frame, to.frame))
+        rays = view.rays()
+        return rays.origins + 3 * rays.directions
+
+    monkeypatch.setattr(module.method, "carried", carried, raising=False)
+    found = keypoint_transfer(module, scene)
+    assert found == {"pck_t": pytest.approx((1 + 0.5 + 0.5 + 1 + 1) / 5), "pairs": 5}
+    assert shown == [(0, 0), (0, 1), (1, 0), (1, 1), (2, 2)]
+    monkeypatch.setattr(module.method, "carried", lambda view, *_: torch.full((len(view), 3), torch.nan))
+    assert keypoint_transfer(module, scene)["pck_t"] == 0
 
 
 @pytest.mark.parametrize("background", ["white", "black"])

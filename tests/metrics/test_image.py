@@ -5,7 +5,16 @@ import pytest
 import torch
 from torchmetrics.functional.image import structural_similarity_index_measure
 
-from forewarp.metrics.image import PSNR_CAP, low_passed, ms_ssim, ms_ssim_legacy, psnr, quantise, ssim
+from forewarp.metrics.image import (
+    PSNR_CAP,
+    low_passed,
+    masked_ssim,
+    ms_ssim,
+    ms_ssim_legacy,
+    psnr,
+    quantise,
+    ssim,
+)
 from tests.support import reference
 
 
@@ -83,6 +92,49 @@ def test_opposite_patterns_are_cut_off_at_zero():
     image = checks.double()[..., None].expand(-1, -1, 3)
     assert ssim(image, 1 - image) < -0.9
     assert ms_ssim(image, 1 - image) == 0
+
+
+def masked_mean(image, mask, axis):
+    """A window's mean of pixels in a mask along an axis, each written out, and whether it has any."""
+    image, mask = (np.moveaxis(x, axis, -1) for x in (image, mask))
+    window = np.exp(-(np.arange(-5, 6) ** 2) / 4.5)
+    window /= window.sum()
+    means, some = np.zeros((2, *mask.shape[:-1], mask.shape[-1] - 10))
+    for at in np.ndindex(means.shape):
+        inside = mask[at[:-1]][at[-1] : at[-1] + 11]
+        some[at] = inside.any()
+        if inside.any():
+            means[at] = (image[at[:-1]][at[-1] : at[-1] + 11] * inside * window).sum() * 11 / inside.sum()
+    return np.moveaxis(means, -1, axis), np.moveaxis(some, -1, axis)
+
+
+def test_masked_ssim_is_its_twin():
+    a, b, mask = noise(23, 27, 3), noise(23, 27, 3, seed=1), torch.zeros(23, 27)
+    mask[3:9, 2:15] = mask[20:, 20:] = 1
+    planes = [(255 * x).round().double().numpy() / 255 for x in (a, b)]
+    values = []
+    for channel in range(3):
+        x, y = (plane[..., channel] for plane in planes)
+        means = []
+        for image in (x, y, x * x, y * y, x * y):
+            means.append(masked_mean(*masked_mean(image, mask.numpy(), 1), 0)[0])
+        m, n, xx, yy, xy = means
+        xx, yy, xy = np.maximum(xx - m * m, 0), np.maximum(yy - n * n, 0), xy - m * n
+        xy = np.sign(xy) * np.minimum(np.sqrt(xx * yy), np.abs(xy))
+        values.append((2 * m * n + 1e-4) * (2 * xy + 9e-4) / ((m * m + n * n + 1e-4) * (xx + yy + 9e-4)))
+    assert masked_ssim(a, b, mask.bool()) == pytest.approx(np.mean(values), abs=1e-10)
+    assert np.abs(np.array(values) - 1).min() == 0  # windows without a pixel
+
+
+def test_what_is_outside_the_mask_does_not_matter():
+    image, mask = noise(23, 27, 3), torch.zeros(23, 27, dtype=torch.bool)
+    mask[4:15, 5:20] = True
+    changed = torch.where(mask[..., None], image, noise(23, 27, 3, seed=1))
+    assert masked_ssim(changed, image, mask) == pytest.approx(1, abs=1e-12)
+    assert masked_ssim(image, image, ~mask & mask) == 1
+    whole = masked_ssim(image, changed, mask | True)
+    assert whole < 0.9
+    assert masked_ssim(image[:10], image[:10], mask[:10]) is None
 
 
 @pytest.mark.parametrize("metric", [psnr, ssim, ms_ssim, ms_ssim_legacy])

@@ -97,6 +97,26 @@ def test_is_its_twin(alex_file):
     assert twin > 1e-3
 
 
+def test_of_a_mask_both_images_are_black_outside_and_maps_are_averaged_inside(alex_file):
+    net, (first, second) = LPIPS("alex", alex_file), images()
+    first, second = ((x * 255).round() / 255 for x in (first, second))
+    mask = torch.zeros(first.shape[:2], dtype=torch.bool)
+    mask[5:30, 9:21] = True
+    total, x = 0, torch.stack([(2 * i * mask[..., None] - 1).permute(2, 0, 1) for i in (first, second)])
+    x, taps = (x - net.shift) / net.scale, lpips._TAPS["alex"]
+    for index, layer in enumerate(net.features):
+        x = layer(x)
+        if index in taps:
+            a, b = x / (x.square().sum(1, keepdim=True).sqrt() + 1e-10)
+            part = ((a - b).square() * getattr(net, f"head{taps.index(index)}")[0]).sum(0)
+            total = (
+                total + torch.nn.functional.interpolate(part[None, None], mask.shape, mode="bilinear")[0, 0]
+            )
+    assert net(first, second, mask) == pytest.approx(float(total[mask].mean()), rel=1e-4)
+    assert net(torch.where(mask[..., None], first, second), first, mask) == 0
+    assert net(first, second, mask & ~mask) is None
+
+
 def test_equal_and_white_images_are_at_no_distance(alex_file):
     net = LPIPS("alex", alex_file)
     first, second = images()

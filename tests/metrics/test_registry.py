@@ -35,13 +35,29 @@ def test_scores_are_the_metrics_in_fixed_order(alex):
     true = target(170, 180, depth=torch.full((170, 180), 2.0))
     prediction = (true.rgb + 0.1).clamp(0, 1)
     scores = ImageSuite({"lpips_alex": alex}).score(prediction, true, torch.full((170, 180), 2.2))
-    absent = ("psnr_box", "lpips_squeeze", "lpips_vgg")
-    assert list(scores) == [name for name in METRICS if name not in absent]
+    absent = [name for name in METRICS if METRICS[name].needs_covisible or name.endswith(("squeeze", "vgg"))]
+    assert list(scores) == [name for name in METRICS if name not in ("psnr_box", *absent)]
     for name in ("psnr", "ssim", "ms_ssim", "ms_ssim_legacy"):
         assert scores[name] == getattr(image, name)(prediction, true.rgb)
     assert scores["dssim"] == (1 - scores["ms_ssim"]) / 2
     assert scores["lpips_alex"] == alex(prediction, true.rgb)
     assert [scores[f"depth_delta_{ratio}"] for ratio in ("1.02", "1.25", "1.5625")] == [0.0, 1.0, 1.0]
+
+
+def test_what_training_images_show_too_is_scored_apart(alex):
+    covisible = torch.zeros(34, 40, dtype=torch.bool)
+    covisible[3:30, 4:9] = True
+    true = replace(target(), covisible=covisible)
+    prediction = torch.where(covisible[..., None], (true.rgb + 0.1).clamp(0, 1), 0.0)
+    suite = ImageSuite({"lpips_alex": alex})
+    scores = suite.score(prediction, true)
+    part = prediction[covisible][None], true.rgb[covisible][None]
+    assert scores["mpsnr"] == image.psnr(*part) > scores["psnr"]
+    assert scores["mssim"] == image.masked_ssim(prediction, true.rgb, covisible)
+    assert scores["mlpips_alex"] == alex(prediction, true.rgb, covisible)
+    scores = suite.score(prediction, replace(true, covisible=covisible & ~covisible))
+    assert not {"mpsnr", "mlpips_alex"} & {*scores}
+    assert suite.absent["mpsnr"] == "frame test/r_007 has no pixel that training images show too"
 
 
 def test_what_an_image_does_not_allow_is_left_out_and_said_once(caplog, monkeypatch):

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from importlib.metadata import PackageNotFoundError, version
-from itertools import chain
+from itertools import chain, product
 from pathlib import Path
 from statistics import fmean, median
 
@@ -21,16 +21,17 @@ from forewarp.clock import now
 from forewarp.drawing.images import at_least, error_colors, in_a_row, write_png
 from forewarp.files import write_json
 from forewarp.methods.effect import switched
-from forewarp.methods.method import HasTrajectories, parameter_count
+from forewarp.methods.method import CarriesPixels, HasTrajectories, parameter_count
 from forewarp.metrics.geometry import end_point_error
 from forewarp.metrics.registry import METRICS, ImageSuite, scores_of_parts, summarise
 from forewarp.ops.grid import block_means, reduced_depth
 from forewarp.progress import time_text
 from forewarp.scene.frame import Scene, spread
-from forewarp.scene.view import Rendering, Target
+from forewarp.scene.view import Moment, Rendering, Target, View
 from forewarp.training.module import DynamicSceneModule
 
-FAMILIES = ("lpips", "ms_ssim", "depth")
+FAMILIES = ("lpips", "mlpips", "ms_ssim", "depth")
+PCK = 0.05  # of an image's longer side, within which a keypoint is where it should be
 _SHEET_SIDE = 300  # least pixels of the shorter side of an image on a sheet
 _LEAST_ALPHA = 0.5 / 255  # 8 bits round it to 0, where stored colours are 0 too
 _PACKAGES = ("forewarp", "torch", "lightning", "torchmetrics", "numba")  # what results depend on
@@ -173,8 +174,9 @@ def evaluate(
     }
     for name in others:
         metrics[f"test_{name}"] = summarise((row["ability"], row["others"][name]) for row in per_image)
-    if (flow := flow_error(module, scene)) is not None:
-        metrics["flow"] = flow
+    for name, of_motion in (("flow", flow_error), ("keypoints", keypoint_transfer)):
+        if (found := of_motion(module, scene)) is not None:
+            metrics[name] = found
     write_json(folder / "per_image.json", {"images": per_image})
     write_json(folder / "metrics.json", metrics)
     return metrics
@@ -227,6 +229,33 @@ def flow_error(module: DynamicSceneModule, scene: Scene) -> dict | None:
         return None
     points, times = truth.points[:, 0].to(module.device), truth.times.float().to(module.device)
     return end_point_error(module.method.trajectories(points, times), truth.points)
+
+
+@torch.no_grad()
+def keypoint_transfer(module: DynamicSceneModule, scene: Scene) -> dict | None:
+    """Return dycheck's PCK-T: the share of keypoints that the method carries from one training frame to
+    another, less than 5 % of the longer side from where they are seen there; None without keypoints, or a
+    method that carries none. The mean over all pairs of frames that see some in common, a frame and itself
+    too, of the mean over these.
+
+    Source: Gao et al., "Monocular Dynamic View Synthesis: A Reality Check" (2022).
+    """
+    frames = [(i, frame) for i, frame in enumerate(scene.train) if frame.keypoints is not None]
+    if not frames or not isinstance(module.method, CarriesPixels):
+        return None
+    shares = []
+    for (i, first), (j, second) in product(frames, repeat=2):
+        seen = (first.keypoints[:, 2] > 0) & (second.keypoints[:, 2] > 0)
+        if not bool(seen.any()):
+            continue
+        camera = first.camera
+        column, row = first.keypoints[seen, :2].floor().long().unbind(-1)
+        pixels = row.clamp(0, camera.height - 1) * camera.width + column.clamp(0, camera.width - 1)
+        moments = (Moment(f.time, number, f.camera_id) for number, f in ((i, first), (j, second)))
+        places, ahead = second.camera.project(module.method.carried(View(camera, pixels), *moments).cpu())
+        near = (places - second.keypoints[seen, :2]).norm(dim=-1) < PCK * max(camera.width, camera.height)
+        shares.append(float((near & (ahead > 0)).float().mean()))
+    return {"pck_t": fmean(shares), "pairs": len(shares)} if shares else None
 
 
 def _reduced(view: RenderedView, by: int, has_alpha: bool) -> RenderedView:
@@ -303,6 +332,8 @@ def show(metrics: dict, folder: Path, absent: dict[str, str]) -> None:
         error, motion = flow["epe_moving"], flow["motion_mean"]
         share = f"{error / motion:.0%} of their motion {motion:.4f}"
         lines.append(f"flow: moving points off by {error:.4f}, {share}")
+    if keypoints := metrics.get("keypoints"):
+        lines.append(f"keypoints: {keypoints['pck_t']:.1%} carried to within {PCK:.0%} of an image (PCK-T)")
     lines += [*notes_of(metrics["protocol"]), *([without(absent)] if absent else [])]
     lines += [f"numbers  {folder / 'metrics.json'}", f"images   {folder / 'images'}"]
     if (sheets := folder / "images" / "sheets").is_dir():

@@ -36,6 +36,7 @@ MARGIN = 0.125  # share of an image's longer side; what projects farther outside
 _LENS_MARGIN = 1.3  # of the squared distance from the axis that the image's border reaches
 _BORDER = 16  # points along each side of an image
 _TRANSPARENT = 1e-6  # opacity below which a pixel has no depth
+_SHOWN = 0.1  # opacity from which a pixel shows something that can be followed
 _VISIBLE = 0.02  # opacity from which there is any matter
 _NEIGHBOURS = 4  # particles that a point goes with
 _COLLAPSED = 0.05  # of the longest axis: what a blend of maps has pressed flatter is not stretched again
@@ -130,16 +131,33 @@ class GaussiansSnapshot:
         """Render ``view`` over ``background`` (3,). Pixels and crops are taken from the whole image, which
         costs little.
         """
-        pinhole = pinhole_of(view.camera, self.blur)
-        splats = project(self.gaussians, self.warp, pinhole, self.color_basis, self.opacity_basis)
-        color, distance, through = rasterize(splats, *pinhole.size, self.chunk)
-        color, distance, through = color.reshape(3, -1).T, distance.reshape(-1), through.reshape(-1)
-        if view.indices is not None:
-            rows = view.indices.to(color.device)
-            color, distance, through = color[rows], distance[rows], through[rows]
+        color, distance, through = self._drawn(view)
         opacity = 1 - through
         depth = torch.where(opacity > _TRANSPARENT, distance / opacity.clamp(min=_TRANSPARENT), 0.0)
         return Rendering(color + through[:, None] * background.to(color), depth, opacity)
+
+    def _drawn(self, view: View, instead: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor]:
+        """Return what the pixels of a view show: colour (R, 3), or what each Gaussian has ``instead`` (N, 3)
+        of one; distance times coverage (R,); and what is let through (R,).
+        """
+        pinhole = pinhole_of(view.camera, self.blur)
+        splats = project(self.gaussians, self.warp, pinhole, self.color_basis, self.opacity_basis)
+        if instead is not None:
+            values = torch.cat([splats.values[:, : COLUMN.red], instead, splats.values[:, COLUMN.depth :]], 1)
+            splats = splats._replace(values=values)
+        color, distance, through = rasterize(splats, *pinhole.size, self.chunk)
+        drawn = color.reshape(3, -1).T, distance.reshape(-1), through.reshape(-1)
+        if view.indices is None:
+            return drawn
+        return tuple(part[view.indices.to(part.device)] for part in drawn)
+
+    def carried(self, view: View, places: Tensor) -> Tensor:
+        """Return the mean place (R, 3) of what each pixel shows, with the Gaussians at ``places`` (N, 3); NaN
+        where it shows next to nothing.
+        """
+        mean, _, through = self._drawn(view, places)
+        opacity = 1 - through[:, None]
+        return torch.where(opacity > _SHOWN, mean / opacity, torch.nan)
 
     def share(self, view: View, rows: Tensor) -> Tensor:
         """Return the share (R,) in [0, 1] of each pixel that is rows (N,) bool, as nothing hides it: render

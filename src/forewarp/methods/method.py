@@ -278,6 +278,16 @@ class HasTrajectories(Protocol):
 
 
 @runtime_checkable
+class CarriesPixels(Protocol):
+    """Follow what an image shows through time."""
+
+    def carried(self, view: View, moment: Moment, to: Moment) -> Tensor:
+        """Return where (R, 3) what the pixels of a view show at a moment is at another one, in world units;
+        NaN where they show nothing.
+        """
+
+
+@runtime_checkable
 class HasBounds(Protocol):
     """Bound all matter."""
 

@@ -16,6 +16,7 @@ from torch.nn import functional as F
 from forewarp.metrics.registry import MS_SSIM_LEAST_SIDE, SSIM_LEAST_SIDE
 
 PSNR_CAP = 100.0
+_REACH = 5  # pixels of a window on either side of its middle
 _C1, _C2 = 0.01**2, 0.03**2
 _SCALE_WEIGHTS = (0.0448, 0.2856, 0.3001, 0.2363, 0.1333)
 
@@ -89,6 +90,37 @@ def ssim(prediction: Tensor, target: Tensor) -> float | None:
     return float(_similarity(a, b)[0].mean())
 
 
+def masked_ssim(prediction: Tensor, target: Tensor, mask: Tensor) -> float | None:
+    """Structural similarity of the pixels of a mask (H, W) bool, as dycheck's mSSIM.
+
+    Every mean over a window is over its pixels in the mask alone, first along rows, then along columns, as in
+    a partial convolution; windows stay inside the image. A window without any such pixel counts as 1, which
+    their code gives as well: a number over few pixels is higher than over many.
+
+    Returns:
+        None for an image with a side below 11 pixels, as the window does not fit.
+
+    Source: Gao et al., "Monocular Dynamic View Synthesis: A Reality Check" (2022).
+    """
+    a, b = (x.permute(2, 0, 1) for x in image_pair(prediction, target))
+    if min(a.shape[1:]) < SSIM_LEAST_SIDE:
+        return None
+    means, inside = torch.stack([a, b, a * a, b * b, a * b]), mask.to(a)
+    for axis in (-1, -2):
+        length = means.shape[axis] - 2 * _REACH
+        inner = means * inside
+        blurred = sum(w * inner.narrow(axis, k, length) for k, w in enumerate(_window()))
+        count = sum(inside.narrow(axis, k, length) for k in range(2 * _REACH + 1))
+        means = torch.where(count > 0, blurred * (2 * _REACH + 1) / count.clamp(min=1), 0.0)
+        inside = (count > 0).to(a)
+    mean_a, mean_b, square_a, square_b, product = means
+    variance_a, variance_b = ((s - m**2).clamp(min=0) for s, m in ((square_a, mean_a), (square_b, mean_b)))
+    most = (variance_a * variance_b).sqrt()
+    covariance = (product - mean_a * mean_b).clamp(-most, most)
+    similarity = (2 * mean_a * mean_b + _C1) * (2 * covariance + _C2)
+    return float((similarity / ((mean_a**2 + mean_b**2 + _C1) * (variance_a + variance_b + _C2))).mean())
+
+
 def ms_ssim(prediction: Tensor, target: Tensor) -> float | None:
     """Structural similarity over five scales, mean over channels, as ``tf.image.ssim_multiscale``.
 
@@ -142,16 +174,17 @@ def _similarity(a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
 
 def _blur(images: Tensor) -> Tensor:
     """The Gaussian mean over 11 x 11 pixels, (..., H, W) -> (..., H-10, W-10), one axis after the other."""
-    offsets = torch.arange(-5, 6, dtype=images.dtype)
-    weights = torch.exp(-(offsets**2) / (2 * 1.5**2))
     for axis in (-2, -1):
-        length = images.shape[axis] - 10
+        length = images.shape[axis] - 2 * _REACH
         # Sums of shifted images: PyTorch's float64 convolution takes several times as long.
-        shifted = (
-            w * images.narrow(axis, k, length) for k, w in enumerate((weights / weights.sum()).tolist())
-        )
-        images = sum(shifted)
+        images = sum(w * images.narrow(axis, k, length) for k, w in enumerate(_window()))
     return images
+
+
+def _window() -> list[float]:
+    """Return the weights of a Gaussian window of 11 pixels."""
+    weights = torch.exp(-(torch.arange(-_REACH, _REACH + 1, dtype=torch.float64) ** 2) / (2 * 1.5**2))
+    return (weights / weights.sum()).tolist()
 
 
 def low_passed(image: Tensor, pixels: float) -> Tensor:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import os
 import pickle
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from importlib import resources
 from pathlib import Path
 
@@ -129,24 +129,36 @@ class LPIPS(nn.Module):
 
         Cost: one pass of the backbone over both images, holding two layers at a time.
         """
+        return sum(part.mean((1, 2, 3)) for part in self._maps(first, second))
+
+    def _maps(self, first: Tensor, second: Tensor) -> Iterator[Tensor]:
+        """Yield the distances (B, 1, h, w) of each layer that is compared, at its places."""
         x = (torch.cat([first, second]) - self.shift) / self.scale
-        total = x.new_zeros(len(first))
         for index, layer in enumerate(self.features):
             x = layer(x)
             if index in _TAPS[self.net]:
                 head = getattr(self, f"head{_TAPS[self.net].index(index)}")
                 normalised = x / (torch.linalg.vector_norm(x, dim=1, keepdim=True) + _EPSILON)
                 a, b = normalised.chunk(2)
-                total = total + F.conv2d((a - b).square(), head).mean((1, 2, 3))
-        return total
+                yield F.conv2d((a - b).square(), head)
 
-    def forward(self, prediction: Tensor, target: Tensor) -> float | None:
-        """Distance of two images (H, W, 3) in [0, 1], rounded to 8 bits; None for a side below 32 pixels."""
+    @torch.no_grad()
+    def forward(self, prediction: Tensor, target: Tensor, mask: Tensor | None = None) -> float | None:
+        """Distance of two images (H, W, 3) in [0, 1], rounded to 8 bits; None for a side below 32 pixels.
+
+        With a mask (H, W) bool, as dycheck's mLPIPS: both images are black outside it, and the layers' maps,
+        enlarged to the image, are averaged inside; None where that is nowhere.
+        """
         pair = image_pair(prediction, target)
-        if min(prediction.shape[:2]) < LPIPS_LEAST_SIDE:
+        if min(prediction.shape[:2]) < LPIPS_LEAST_SIDE or (mask is not None and not bool(mask.any())):
             return None
-        a, b = ((x.permute(2, 0, 1)[None] * 2 - 1).to(self.shift) for x in pair)
-        return float(self.distance(a, b))
+        shown = 1.0 if mask is None else mask.to(pair[0])[..., None]
+        a, b = ((2 * (x * shown).permute(2, 0, 1)[None] - 1).to(self.shift) for x in pair)
+        if mask is None:
+            return float(self.distance(a, b))
+        size = tuple(mask.shape)
+        whole = sum(F.interpolate(part, size, mode="bilinear") for part in self._maps(a, b))
+        return float(whole[0, 0][mask.to(whole.device)].mean())
 
 
 def find_lpips_weights(net: str, extra: Iterable[str | Path] | str | Path | None = ()) -> Path | None:

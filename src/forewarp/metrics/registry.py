@@ -38,6 +38,7 @@ class Metric:
         score: computes it from the prediction (H, W, 3), the ``Target`` and the rendered depth (H, W) or
             None; gives None for an image that does not allow it. None: ``ImageSuite`` has it otherwise.
         needs_depth: only computed where both the rendered and the true depth are known.
+        needs_covisible: only computed where it is known what training images show too; of these pixels alone.
         needs_foreground: None tells that the image has no foreground.
         least_side: fewest pixels that a side of the image must have.
         dissimilarity_of: a similarity before it in the list, of which it is half of what is missing to 1.
@@ -51,6 +52,7 @@ class Metric:
     summary: bool = True
     score: Callable[[Tensor, Target, Tensor | None], float | None] | None = None
     needs_depth: bool = False
+    needs_covisible: bool = False
     needs_foreground: bool = False
     least_side: int = 0
     dissimilarity_of: str = ""
@@ -101,6 +103,16 @@ def scores_of_parts(prediction: Tensor, target: Target) -> dict[str, dict[str, f
     chosen = zip(PARTS, (valid & target.moving, valid & ~target.moving))
     found = {part: _psnr_of(pixels, prediction, target) for part, pixels in chosen}
     return {part: {"psnr": value} for part, value in found.items() if value is not None}
+
+
+def _covisible_psnr(prediction: Tensor, target: Target, depth: Tensor | None) -> float | None:
+    return _psnr_of(target.covisible, prediction, target)
+
+
+def _covisible_ssim(prediction: Tensor, target: Target, depth: Tensor | None) -> float | None:
+    from forewarp.metrics.image import masked_ssim
+
+    return masked_ssim(prediction, target.rgb, target.covisible)
 
 
 def _psnr_in_box(prediction: Tensor, target: Target, depth: Tensor | None) -> float | None:
@@ -159,6 +171,18 @@ METRICS: dict[str, Metric] = {
         # Distances of different backbones are not comparable; weights are files, so the suite holds the nets.
         *(
             Metric(f"lpips_{net}", f"LPIPS ({net})", higher_is_better=False, least_side=LPIPS_LEAST_SIDE)
+            for net in NETS
+        ),
+        Metric("mpsnr", "mPSNR", 2, unit="dB", score=_covisible_psnr, needs_covisible=True),
+        Metric("mssim", "mSSIM", score=_covisible_ssim, needs_covisible=True, least_side=SSIM_LEAST_SIDE),
+        *(
+            Metric(
+                f"mlpips_{net}",
+                f"mLPIPS ({net})",
+                higher_is_better=False,
+                needs_covisible=True,
+                least_side=LPIPS_LEAST_SIDE,
+            )
             for net in NETS
         ),
         *(
@@ -236,8 +260,12 @@ class ImageSuite:
         try:
             for name, metric in METRICS.items():
                 lacks_depth = metric.needs_depth and (predicted_depth is None or target.depth is None)
+                if metric.needs_covisible and target.covisible is None:
+                    continue
                 if name in self.lpips:
                     value = self.lpips[name](prediction, target.rgb)
+                elif name.removeprefix("m") in self.lpips:
+                    value = self.lpips[name.removeprefix("m")](prediction, target.rgb, target.covisible)
                 elif metric.dissimilarity_of in scores:
                     value = (1 - scores[metric.dissimilarity_of]) / 2
                 elif metric.score is None or lacks_depth or (name == "psnr_box" and not self.mask_box):
@@ -295,6 +323,8 @@ def summarise(rows: Iterable[tuple[str, Mapping[str, float]]]) -> dict[str, dict
 def _reason(name: str, target: Target) -> str:
     """Say why an image lacks a metric."""
     metric, (height, width) = METRICS[name], target.rgb.shape[:2]
+    if metric.needs_covisible and not bool(target.covisible.any()):
+        return f"frame {target.frame.name} has no pixel that training images show too"
     if metric.needs_foreground:
         return f"frame {target.frame.name} has no foreground"
     if min(height, width) < metric.least_side:

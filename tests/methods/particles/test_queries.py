@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from forewarp.methods.method import HasEllipsoids, HasLayers
+from forewarp.methods.method import CarriesPixels, HasEllipsoids, HasLayers
 from forewarp.methods.particles.model import pinhole_of
 from forewarp.ops.gaussians import Gaussians, moved, project, project_reference
 from forewarp.scene.view import Moment, View
@@ -51,6 +51,23 @@ def test_points_go_with_the_particles_beside_them(motion):
     assert float((paths[:, 1] - paths[:, 0]).norm(dim=-1).amin()) > 0.01
     beside = place[:20] + 0.1 * torch.randn(20, 3, generator=generator)
     torch.testing.assert_close(method.trajectories(beside, times[:1])[:, 0], beside)
+
+
+def test_what_a_pixel_shows_goes_with_the_particles_that_show_it():
+    method, generator = module_with(DATA).method, torch.Generator().manual_seed(0)
+    assert isinstance(method, CarriesPixels)
+    method.nodes.translations.data += 0.05 * torch.randn(method.nodes.translations.shape, generator=generator)
+    alone = method.only(torch.tensor([7]))
+    alone.opacity.data.fill_(9.0)
+    first, later = Moment(0.2), Moment(0.7)
+    before, after = (moved(alone.means, alone.warp(moment.time))[0].detach() for moment in (first, later))
+    camera = DATA.scene.train[0].camera
+    column, row = camera.project(before)[0][0].floor().long().tolist()
+    view = View(camera, torch.tensor([row * camera.width + column, 0]))
+    carried = alone.carried(view, first, later)
+    torch.testing.assert_close(carried[:1], after, rtol=1e-4, atol=1e-4)
+    assert bool(carried[1].isnan().all())
+    assert float((after - before).norm()) > 0.01
 
 
 def test_where_there_is_nothing_to_see_there_are_no_bounds_and_all_particles_are_matter():

@@ -74,6 +74,7 @@ class Particles(Method):
     matter, bounds, trajectories = queries.matter, queries.bounds, queries.trajectories
     ellipsoids, template, movement = queries.ellipsoids, queries.template, queries.movement
     moving, in_motion, only = queries.moving, queries.in_motion, queries.only
+    carried = queries.carried
 
     def __init__(
         self,

@@ -21,6 +21,7 @@ from forewarp.scene.box import Box
 from forewarp.scene.camera import Camera
 from forewarp.scene.cloud import Cloud, Ellipsoids, nearest
 from forewarp.scene.frame import Frame, spread
+from forewarp.scene.view import Moment, View
 
 if TYPE_CHECKING:
     from forewarp.methods.particles.model import Particles
@@ -116,6 +117,12 @@ def matter(self: Particles) -> Cloud:
 def trajectories(self: Particles, points: Tensor, times: Tensor) -> Tensor:
     """See ``HasTrajectories``."""
     return self.moving().trajectories(points, times)
+
+
+@torch.no_grad()
+def carried(self: Particles, view: View, moment: Moment, to: Moment) -> Tensor:
+    """See ``CarriesPixels``."""
+    return self.at(moment).carried(view, moved(self.means.data, self.warp(to.time))[0])
 
 
 def ellipsoids(self: Particles, time: float) -> Ellipsoids:
