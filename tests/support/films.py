@@ -15,11 +15,13 @@ def read_film(path, height, width):
     return np.frombuffer(done.stdout, dtype=np.uint8).reshape(-1, height, width, 3)
 
 
-def write_film(path, frames, *, stamps="N*40", rotation=0, options=()):
-    """Write frames (N, H, W, 3) uint8; ``stamps`` is ffmpeg's expression of the frame N, milliseconds."""
+def write_film(path, frames, *, stamps="N*40", rotation=0, options=(), inputs=()):
+    """Write frames (N, H, W, 3) uint8; ``stamps`` is ffmpeg's expression of the frame N, milliseconds, and
+    ``inputs`` are words for another input, of sound.
+    """
     count, height, width, _ = frames.shape
     ffmpeg = [imageio_ffmpeg.get_ffmpeg_exe(), "-y", "-v", "error"]
-    shape = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-i", "-"]
+    shape = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-i", "-", *inputs]
     times = ["-vf", f"settb=1/1000,setpts='{stamps}'", "-fps_mode", "passthrough", "-enc_time_base", "1:1000"]
     flat = path.with_name(f"flat_{path.name}") if rotation else path
     coded = ["-c:v", "libx264", "-qp", "4", "-pix_fmt", "yuv420p", "-video_track_timescale", "1000", *options]

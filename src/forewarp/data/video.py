@@ -125,6 +125,15 @@ def stamps_of(video: Path) -> np.ndarray:
     return np.sort([float(int(tick) * unit) for tick in ticks if tick.lstrip("-").isdecimal()])
 
 
+def sound_of(video: Path, rate: int, most: float) -> np.ndarray:
+    """Decode the beginning of a video's sound, one channel: (S,) float32, ``rate`` samples a second from the
+    time 0 of its frames on, ``most`` seconds at most; empty where there is none.
+    """
+    call = [imageio_ffmpeg.get_ffmpeg_exe(), "-nostdin", "-v", "quiet", "-i", str(video), "-map", "0:a:0"]
+    call += ["-t", str(most), "-ac", "1", "-af", f"aresample={rate}:async=1:first_pts=0", "-f", "f32le", "-"]
+    return np.frombuffer(subprocess.run(call, capture_output=True).stdout, np.float32)
+
+
 class Log:
     """What ffmpeg says while it runs: ``duration`` in seconds, 0 where unknown; ``stamps`` of the frames so
     far; all other lines, ``rest``.
