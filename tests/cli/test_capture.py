@@ -45,8 +45,15 @@ FILM = "video=a.mp4"
 @pytest.mark.parametrize(
     ("words", "says"),
     [
-        ([], "video, images: expected video=FILE or images=FOLDER, but got neither; set one of them"),
-        ([FILM, "images=empty"], "video, images: expected video=FILE or images=FOLDER, but got both"),
+        ([], "expected video=FILE, videos=FOLDER or images=FOLDER, but got none; set one of them"),
+        ([FILM, "images=empty"], "video, videos, images: expected .* but got video and images; set one"),
+        (["videos=a.mp4"], "videos: expected an existing folder, but got another thing"),
+        (["videos=empty", "colmap=empty"], "colmap: expected images=FOLDER beside it, but got videos="),
+        (["videos=empty", "out=empty/new"], "out: expected a folder outside videos=empty, which is read"),
+        ([FILM, "without=[a]"], "without: expected videos=FOLDER beside it, but got video=; remove it"),
+        (["videos=empty", "without=a"], r"without: expected a list .* but got a; write without=\[a\]"),
+        (["videos=empty", "fixed=x"], "fixed: expected true, false or null, but got x"),
+        (["videos=empty", "rate=0"], "rate: expected pictures a second, above 0, but got 0"),
         (["video=none.mp4"], "video: expected an existing file, but got none: none.mp4"),
         (["video=empty"], "video: expected an existing file, but got another thing: empty"),
         (["images=a.mp4"], "images: expected an existing folder, but got another thing"),

@@ -514,3 +514,18 @@ def test_cameras_without_names_are_not_held_out_by_name(tmp_path, made):
         SceneError, match=r"frames: camera: expected one in all frames or in none, but got 7 of 8"
     ):
         read_scene(tmp_path, "rig")
+
+
+def test_moments_number_instants_of_cameras_with_times_of_their_own(tmp_path):
+    """Frames of one moment have other times, and all are held out together."""
+    cameras, black = posed_cameras(2), np.zeros((20, 30, 3), np.uint8)
+    shots = [
+        PosedShot(f"{n}.png", cameras[n % 2], black, n / 5, taken_by=f"cam{n % 2}", moment=n // 2)
+        for n in range(6)
+    ]
+    write_scene(tmp_path / "toy", shots, near=20.0, far=120.0)
+    scene = read_scene(tmp_path, "toy", test_moments=[1])
+    assert [frame.time for frame in scene.test] == pytest.approx([0.4, 0.6])
+    assert [frame.ability for frame in scene.test] == ["time", "time"]
+    with pytest.raises(SceneError, match=r"data.test_moments: expected numbers of 0 to 2, not all"):
+        read_scene(tmp_path, "toy", test_moments=[3])

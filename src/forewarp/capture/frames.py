@@ -9,7 +9,7 @@ import math
 import re
 import shutil
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import cv2
@@ -28,7 +28,7 @@ Progress = Callable[[int, int], None]
 Step = Callable[[str], object]  # title of a step -> a context manager that gives a ``Progress``
 
 TAKEN = "pictures.json"  # what was taken; written last
-_MIN_IMAGES, _SHORT, _ENOUGH, _MOST = 3, 150, 120, 300  # frames: fewest, of a short film, of a slow one, most
+_MIN_IMAGES, SHORT, _ENOUGH, MOST = 3, 150, 120, 300  # frames: fewest, of a short film, of a slow one, most
 _STEP = 8.0  # pixels of 640, by which what is fast may move from one frame that is taken to the next
 _FAST, _FLOW = 0.9, 160  # quantile of an image's motion that counts; pixels of the longer side to measure it
 _LEAST_SIDE = 32  # pixels that OpenCV's flow needs; of fewer it crashes
@@ -39,6 +39,10 @@ _FLAT = 1e-9  # mean square of a second difference below which an image has no e
 _BLACK, _LIT = 24, 60  # of 255: in a bar at most, black of limited range and noise; beside it at least
 _EVEN, _LEAST_BAR = 2, 0.02  # pixels of 640 by which bars at both sides may differ; least share of the side
 _WHOLE = 0.9  # share of its duration after which a video counts as whole
+NO_MASKS = (
+    "expected masks in which what moves is bright, but got none above 127 of 255; write it as 255, or leave "
+    "out masks="
+)
 _DAMAGE = re.compile("partial file|ended prematurely|corrupt")
 
 
@@ -74,6 +78,9 @@ class Frames:
         originals: the user's names by ours; empty for a video.
         assumed: a line about where times come from; None where that is plain.
         why: of a video, why so many frames were taken.
+        masks_from: who says what moves.
+        cameras: of a rig, the camera that took each image, by the image's name.
+        moments: of a rig, the number of the instant of each image, by name.
     """
 
     folder: Path
@@ -86,6 +93,9 @@ class Frames:
     originals: Mapping[str, str]
     assumed: str | None = None
     why: str | None = None
+    masks_from: str = "the masks given"
+    cameras: Mapping[str, str] = field(default_factory=dict)
+    moments: Mapping[str, int] = field(default_factory=dict)
 
 
 def take(
@@ -122,8 +132,8 @@ def take(
             done["why"] = done["why"] or why
         else:
             done = _from_folder(folder, source, size, step)
-        if source.masks is not None:
-            _write_masks(dark, source.masks, done)
+        if source.masks is not None and not write_masks(dark, source.masks, done):
+            raise ValueError(f"{source.masks}: {NO_MASKS}")
         write_json(work / TAKEN, done)
     sizes = {name: tuple(size) for name, size in done["sizes"].items()}
     return Frames(folder, dark if source.masks else None, **done | {"sizes": sizes})
@@ -222,10 +232,10 @@ def frames_for(speeds: np.ndarray) -> tuple[int, str]:
     (120, 'what is fast moves by 0.5 pixels of 640 a frame; 120 at least')
     """
     found = len(speeds)
-    if found <= _SHORT:
+    if found <= SHORT:
         return found, "every frame of a short film"
     asked, least = math.ceil(float(speeds.sum()) / _STEP), min(_ENOUGH, found // 2)
-    count = min(found, _MOST, max(asked, least))
+    count = min(found, MOST, max(asked, least))
     bound = "" if count == asked else f"; {count} at {'least' if asked < count else 'most'}"
     return count, f"what is fast moves by {float(speeds.mean()):.2g} pixels of 640 a frame{bound}"
 
@@ -240,7 +250,7 @@ def _from_folder(folder: Path, source: Source, size: int | None, step: Step) -> 
     plainly. Alpha is kept where all images have it.
     """
     as_stored = source.colmap is not None
-    paths = _images_in(source.images, as_stored)
+    paths = images_in(source.images, as_stored)
     if len(paths) < _MIN_IMAGES:
         got = f"{len(paths)} PNG or JPEG files" if paths else "none"
         raise ValueError(f"{source.images}: expected a folder of many pictures, PNG or JPEG, but got {got}")
@@ -293,7 +303,7 @@ def _record(times: dict, rows: Sequence[int], found: int, widths, sizes: dict, o
     return numbers | {"originals": originals}
 
 
-def _images_in(folder: Path, deep: bool = False) -> list[Path]:
+def images_in(folder: Path, deep: bool = False) -> list[Path]:
     """List images in order, with ``deep`` also those in subfolders; other systems leave files with a leading
     dot beside them, which are none.
 
@@ -335,13 +345,13 @@ def shrunk(pixels: np.ndarray, height: int, width: int) -> np.ndarray:
     return small[0].permute(1, 2, 0).round().clamp(0, 255).byte().numpy()
 
 
-def _write_masks(folder: Path, masks: Path, done: dict) -> None:
-    """Write a mask for each image, in which black is what moves and white is matched.
+def write_masks(folder: Path, masks: Path, done: dict) -> bool:
+    """Write a mask for each image, in which black is what moves and white is matched; tell whether any does.
 
     There are as many as frames in the video, or images in the folder, in order; else a mask has the name of
     its image. A folder's images have names of the user's: there the name comes first.
     """
-    paths, originals, names = _images_in(masks, deep=True), done["originals"], list(done["times"])
+    paths, originals, names = images_in(masks, deep=True), done["originals"], list(done["times"])
     by_name = {path.relative_to(masks).with_suffix("").as_posix(): path for path in paths}
     stems = [Path(originals.get(name, name)).with_suffix("").as_posix() for name in names]
     are_named, are_counted = all(stem in by_name for stem in stems), len(paths) == done["found"]
@@ -359,11 +369,7 @@ def _write_masks(folder: Path, masks: Path, done: dict) -> None:
         moving = adaptive_max_pool2d(bright(path).float()[None, None], (height, width))[0, 0] > 0
         any_moves |= bool(moving.any())
         write_image(folder / f"{name}.png", (255 * ~moving).byte().numpy())
-    if not any_moves:
-        raise ValueError(
-            f"{masks}: expected masks in which what moves is bright, but got none above 127 of 255; write it "
-            "as 255, or leave out masks="
-        )
+    return any_moves
 
 
 def sharpness(grey: np.ndarray) -> float:

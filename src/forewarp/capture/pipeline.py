@@ -25,7 +25,7 @@ from forewarp.files import folder_written_whole, read_json, write_json
 
 ABOUT, PICTURE = "capture.json", "capture.png"  # in the scene's folder
 _BURNT = "burnt_in.png"  # in the work folder: dark where something is burnt into all images
-_ERROR = "error.json"  # pixels, before points were deleted
+BEST, KEPT = "best", "error.json"  # in the work folder what was found; in that what is told of it
 _AGAIN = "of half as many too few had poses"
 _STATE = "about.json"  # what the work in a work folder depends on
 
@@ -62,7 +62,7 @@ def capture(
     cv2.setNumThreads(search.threads or -1)
     if search.threads is not None:
         torch.set_num_threads(search.threads)
-    about["files"] = [_fingerprint(path) for path in (source.path, source.masks) if path is not None]
+    about["files"] = [fingerprint(path) for path in (source.path, source.masks) if path is not None]
     with work_folder(out, about) as work:
         images = take(work, source, step, count=frames, size=size, threads=search.threads)
         if source.colmap is not None:
@@ -87,22 +87,18 @@ def capture(
         limits = scene.limits_of(found)
         with step("what moves, writing") as progress, folder_written_whole(out, ABOUT) as folder:
             burnt = _burnt_in(work)
-            written = scene.write(folder, source, images, found, limits, progress, burnt)
+            written = scene.write(folder, source.video is not None, images, found, limits, progress, burnt)
             if limits is not None:
                 write_png(folder / PICTURE, scene.draw(found, limits))
             facts = scene.facts_of(source, images, found, limits, *written, burnt)
-            files = (path for path in sorted(folder.rglob("*")) if path.is_file())
-            facts["bytes"] = {path.relative_to(folder).as_posix(): path.stat().st_size for path in files}
-            write_json(folder / ABOUT, facts)
+            record(folder, facts)
     return facts
 
 
 def find_poses(work: Path, images: Frames, search: Search, step: Step, force: bool = False) -> Reconstruction:
     """Find poses, unless an earlier call has done so."""
-    best, part = work / "best", work / "part"
-    if best.is_dir():
-        found = Reconstruction.of(pycolmap.Reconstruction(best))
-        return dataclasses.replace(found, **read_json(best / _ERROR))
+    if (before := kept(work)) is not None:
+        return dataclasses.replace(Reconstruction.of(before[0]), **before[1])
     for look, every in (("first ", poses.first_look(len(images.times))), ("", None)):
         with step(f"{look}features") as progress:
             database = poses.find_features(work, images.folder, images.masks, search, progress, every)
@@ -125,11 +121,32 @@ def find_poses(work: Path, images: Frames, search: Search, step: Step, force: bo
         error = poses.adjust(model, search, progress)
     found = dataclasses.replace(Reconstruction.of(model), error=error)
     refuse_poses(found, images, database)
-    part.mkdir(exist_ok=True)
-    model.write(part)
-    write_json(part / _ERROR, {"error": error})
-    part.rename(best)
+    keep(work, model, {"error": error})
     return found
+
+
+def keep(work: Path, model: pycolmap.Reconstruction, told: Mapping[str, object]) -> None:
+    """Keep what was found in ``work / "best"``, whole."""
+    part = work / "part"
+    shutil.rmtree(part, ignore_errors=True)
+    part.mkdir()
+    model.write(part)
+    write_json(part / KEPT, dict(told))
+    shutil.rmtree(work / BEST, ignore_errors=True)
+    part.rename(work / BEST)
+
+
+def kept(work: Path) -> tuple[pycolmap.Reconstruction, dict] | None:
+    """Give what an earlier call has kept, and what it told of it."""
+    told = read_json(work / BEST / KEPT)
+    return None if told is None else (pycolmap.Reconstruction(work / BEST), told)
+
+
+def record(folder: Path, facts: dict) -> None:
+    """Write what was found into a scene's folder, with the size of each file."""
+    files = (path for path in sorted(folder.rglob("*")) if path.is_file())
+    facts["bytes"] = {path.relative_to(folder).as_posix(): path.stat().st_size for path in files}
+    write_json(folder / ABOUT, facts)
 
 
 def _burnt_in(work: Path) -> np.ndarray | None:
@@ -138,7 +155,7 @@ def _burnt_in(work: Path) -> np.ndarray | None:
     return read_image(path)[..., 0].numpy() == 0 if path.exists() else None
 
 
-def _fingerprint(path: Path) -> str:
+def fingerprint(path: Path) -> str:
     """A digest of the name, bytes and time of change of a file, or of each file of a folder."""
     files = [path] if path.is_file() else sorted(file for file in path.rglob("*") if file.is_file())
     files = [file for file in files if not is_hidden(file.relative_to(path))]

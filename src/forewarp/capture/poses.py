@@ -213,18 +213,22 @@ def find_features(
     search: Search,
     progress: Progress,
     every: int | None = None,
+    names: Sequence[str] | None = None,
 ) -> Path:
     """Find the features of all images, or of each ``every``-th, that have none yet; return the database.
 
     Args:
         folder: of the database.
-        images: folder of images of one size.
+        images: folder of images of one size; or of a folder for each camera, whose images have one size.
         masks: folder of ``<image's name>.png``; features on black are left out.
         search: how to search.
         progress: called with images done and all.
         every: of ``first_look``; None: all. The numbers of images in the database are the same.
+        names: of those to look at, from ``images`` on, of a camera all at once; None: all that are there.
     """
-    database, names = folder / "database.db", sorted(path.name for path in images.iterdir())
+    database = folder / "database.db"
+    names = sorted(names or (path.name for path in images.iterdir()))
+    mode = pycolmap.CameraMode.PER_FOLDER if "/" in names[0] else pycolmap.CameraMode.SINGLE
     reader = pycolmap.ImageReaderOptions(camera_model=search.lens)
     if masks is not None:
         reader.mask_path = masks
@@ -235,14 +239,8 @@ def find_features(
     with pycolmap.Database.open(database) as base:
         numbers = {image.name: image.image_id for image in base.read_all_images()}
         done = {name for name, number in numbers.items() if base.exists_keypoints(number)}
-    if not numbers:
-        pycolmap.import_images(
-            database,
-            images,
-            camera_mode=pycolmap.CameraMode.SINGLE,
-            image_names=names,
-            options=reader,
-        )
+    if new := [name for name in names if name not in numbers]:
+        pycolmap.import_images(database, images, camera_mode=mode, image_names=new, options=reader)
     chosen = names[::every]
     left = [name for name in chosen if name not in done]
     progress(len(chosen) - len(left), len(chosen))
@@ -251,7 +249,7 @@ def find_features(
             database,
             images,
             image_names=left[start : start + _BATCH],
-            camera_mode=pycolmap.CameraMode.SINGLE,
+            camera_mode=mode,
             reader_options=reader,
             extraction_options=options,
             device=pycolmap.Device.cpu,
@@ -269,17 +267,30 @@ def first_look(count: int) -> int:
     return 2 ** math.ceil(math.log2(max(1.0, count / _LOOK)))
 
 
-def match(database: Path, search: Search, progress: Progress, every: int | None = None) -> None:
-    """Match and verify the pairs of images that are not matched yet, or a few of each ``every``-th image."""
+def match(
+    database: Path,
+    search: Search,
+    progress: Progress,
+    every: int | None = None,
+    named: Sequence[tuple[str, str]] | None = None,
+) -> None:
+    """Match and verify the pairs of images that are not matched yet: those ``named``; None: see ``pairs_of``,
+    or a few of each ``every``-th image.
+    """
     with pycolmap.Database.open(database) as base:
-        images = sorted((image.name, image.image_id) for image in base.read_all_images())
-        pairs = pairs_of(len(images), search.matching)
-        if every is not None:  # 1, 2, 4 ... of those further
-            pairs = [(i, j) for i, j in pairs if i % every == j % every == 0 and ((j - i) & (j - i - 1)) == 0]
+        images = {image.name: image.image_id for image in base.read_all_images()}
+        pairs = named
+        if named is None:
+            names, rows = sorted(images), pairs_of(len(images), search.matching)
+            if every is not None:  # 1, 2, 4 ... of those further
+                rows = [
+                    (i, j) for i, j in rows if i % every == j % every == 0 and ((j - i) & (j - i - 1)) == 0
+                ]
+            pairs = [(names[i], names[j]) for i, j in rows]
         left = [
-            f"{images[i][0]} {images[j][0]}\n"
-            for i, j in pairs
-            if not base.exists_two_view_geometry(images[i][1], images[j][1])
+            f"{first} {second}\n"
+            for first, second in pairs
+            if not base.exists_two_view_geometry(images[first], images[second])
         ]
     options = pycolmap.FeatureMatchingOptions(use_gpu=False, num_threads=search.threads or -1)
     verification = pycolmap.TwoViewGeometryOptions()
@@ -394,12 +405,26 @@ def pairs_of(count: int, matching: str) -> list[tuple[int, int]]:
 
 
 def reconstruct(
-    database: Path, images: Path, folder: Path, search: Search, progress: Progress
+    database: Path,
+    images: Path,
+    folder: Path,
+    search: Search,
+    progress: Progress,
+    names: Sequence[str] | None = None,
 ) -> pycolmap.Reconstruction | None:
-    """Find cameras and points; return the model of the most images, or None."""
+    """Find cameras and points; return the model of the most images, or None.
+
+    Args:
+        database: of features and matches.
+        images: folder of the images.
+        folder: for what is found.
+        search: how to search.
+        progress: called with images done and all.
+        names: of a rig, the images to find, of which two are a model; None: all.
+    """
     with pycolmap.Database.open(database) as base:
-        total = base.num_images()
-    done = 1
+        total = len(names or base.read_all_images())
+    done, least = 1, MIN_MODEL if names is None else 2
 
     def count() -> None:
         nonlocal done
@@ -407,8 +432,9 @@ def reconstruct(
         progress(min(done, total), total)
 
     options = pycolmap.IncrementalPipelineOptions(
-        random_seed=search.seed, num_threads=search.threads or -1, min_model_size=MIN_MODEL
+        random_seed=search.seed, num_threads=search.threads or -1, min_model_size=least
     )
+    options.image_names = list(names or ())
     options.mapper.random_seed = options.triangulation.random_seed = search.seed
     pycolmap.set_random_seed(search.seed)
     folder.mkdir(exist_ok=True)
@@ -418,11 +444,14 @@ def reconstruct(
     return max(models.values(), key=lambda model: model.num_reg_images(), default=None)
 
 
-def adjust(model: pycolmap.Reconstruction, search: Search, progress: Progress) -> float:
+def adjust(
+    model: pycolmap.Reconstruction, search: Search, progress: Progress, sure_views: int = _SURE_VIEWS
+) -> float:
     """Adjust all cameras once more to the points that are sure, and so that outliers hardly count.
 
     What moves leaves points that few images agree on, and the mapper's squares of errors let them bend the
-    poses. They are deleted, but those of cameras that would be left with too few.
+    poses. They are deleted, but those of cameras that would be left with too few. A point is sure from
+    ``sure_views`` on.
 
     Returns:
         the mean reprojection error in pixels before it, of all points, so that nothing flatters it.
@@ -432,7 +461,7 @@ def adjust(model: pycolmap.Reconstruction, search: Search, progress: Progress) -
     doubtful = {
         number
         for number, point in model.points3D.items()
-        if point.track.length() < _SURE_VIEWS or point.error > _SURE_ERROR
+        if point.track.length() < sure_views or point.error > _SURE_ERROR
     }
     needed = set()
     for image in model.reg_image_ids():
@@ -551,6 +580,26 @@ def refuse_poses(
                     *frames.sizes[name], camera.width, camera.height
                 )
             )
+    refuse_lenses(found)
+    poses = [camera.camera_to_world for camera in found.cameras.values()]
+    if database is None and not force and not _has_points_ahead(found):
+        if ways := other_readings(poses, _READINGS):
+            raise ValueError(
+                "colmap: expected world-to-camera poses with OpenCV's axes, but got cameras that look at one "
+                f"thing only if {', or if '.join(ways)}; write them anew, or force=true if they are right"
+            )
+        if float(np.abs(found.centers - found.centers[0]).max()) <= _SAME_PLACE * np.abs(found.centers).max():
+            got = "all in one place, which tells nothing of depth; compare the poses"
+            raise ValueError(f"colmap: expected cameras that move, but got {got}, or force=true if it is so")
+    refuse_misfit(found)
+
+
+def refuse_lenses(found: Reconstruction) -> None:
+    """Refuse cameras of a fisheye, or that no lens explains.
+
+    Raises:
+        ValueError: with what was found, and advice.
+    """
     for camera in {(c.width, c.fx, c.lens): c for c in found.cameras.values()}.values():
         degrees = np.degrees(2 * np.arctan(camera.width / (2 * camera.fx)))
         try:
@@ -562,16 +611,14 @@ def refuse_poses(
             raise ValueError(
                 f"{text}; if it is a fisheye, film without it or undistort first; else {_WALK}"
             ) from error
-    poses = [camera.camera_to_world for camera in found.cameras.values()]
-    if database is None and not force and not _has_points_ahead(found):
-        if ways := other_readings(poses, _READINGS):
-            raise ValueError(
-                "colmap: expected world-to-camera poses with OpenCV's axes, but got cameras that look at one "
-                f"thing only if {', or if '.join(ways)}; write them anew, or force=true if they are right"
-            )
-        if float(np.abs(found.centers - found.centers[0]).max()) <= _SAME_PLACE * np.abs(found.centers).max():
-            got = "all in one place, which tells nothing of depth; compare the poses"
-            raise ValueError(f"colmap: expected cameras that move, but got {got}, or force=true if it is so")
+
+
+def refuse_misfit(found: Reconstruction) -> None:
+    """Refuse cameras that are hardly apart, and those whose points do not fit.
+
+    Raises:
+        ValueError: with what was found, and advice.
+    """
     if not len(found.seen):  # of known poses alone; the reader derives what points would tell
         return
     extent = np.linalg.norm(found.centers - np.median(found.centers, axis=0), axis=1).max()
@@ -595,6 +642,19 @@ def _has_points_ahead(found: Reconstruction) -> bool:
     axes = np.stack([np.asarray(camera.camera_to_world)[:3, 2] for camera in found.cameras.values()])
     rows, points = found.seen.T
     return bool((((found.points[points] - found.centers[rows]) * axes[rows]).sum(1) > 0).mean() > 0.5)
+
+
+def errors_of(model: pycolmap.Reconstruction) -> dict[str, float]:
+    """Return the mean distance, in pixels, between where each image has its points and where they fall."""
+    errors = {}
+    for image in model.images.values():
+        ends = [(p.xy, model.points3D[p.point3D_id].xyz) for p in image.points2D if p.has_point3D()]
+        if image.has_pose and ends:
+            fallen = ((xy, image.project_point(xyz)) for xy, xyz in ends)
+            errors[image.name] = float(
+                np.mean([np.linalg.norm(xy - at) for xy, at in fallen if at is not None])
+            )
+    return errors
 
 
 def evidence_of(database: Path) -> Evidence:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -121,7 +121,7 @@ def bounds_of(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def write(
     folder: Path,
-    source: Source,
+    in_seconds: bool,
     frames: Frames,
     found: Reconstruction,
     limits: Limits | None,
@@ -133,7 +133,7 @@ def write(
 
     Args:
         folder: to fill.
-        source: what the images are from.
+        in_seconds: the times are seconds.
         frames: the images; the time of the first registered one becomes 0, that of the last 1.
         found: cameras and points, placed.
         limits: near, far and box.
@@ -151,9 +151,9 @@ def write(
     cameras, times = [found.cameras[name] for name in names], {frames.times[name] for name in names}
     masks, moving_from, share = [None] * len(names), None, 0.0
     if frames.masks is not None:
-        moving_from = "the masks given"
+        moving_from = frames.masks_from
         masks = (read_image(frames.masks / f"{name}.png")[..., 0].numpy() == 0 for name in names)
-    elif len(times) == len(names) and len({(c.width, c.height) for c in cameras}) == 1:
+    elif not frames.cameras and len(times) == len(names) and len({(c.width, c.height) for c in cameras}) == 1:
         found_masks = []
         for mask in moving_masks([frames.folder / name for name in names], cameras):
             found_masks.append(mask)
@@ -179,13 +179,14 @@ def write(
                 small = shrunk(pixels[: height * scale, : width * scale], height, width)
                 write_image(folder / f"images_{scale}" / name, small)
             time = (frames.times[name] - first) / (last - first) if last > first else 0.0
-            yield PosedShot(name, found.cameras[name], pixels, time, moving=moving)
+            rig = {"taken_by": frames.cameras.get(name), "moment": frames.moments.get(name)}
+            yield PosedShot(name, found.cameras[name], pixels, time, moving=moving, **rig)
             progress(len(names) + done, 2 * len(names))
 
     options = {"near": limits.near, "far": limits.far, "aabb": limits.box} if limits else {}
     if moving_from is not None:
         options["moving_from"] = moving_from
-    if source.video is not None:
+    if in_seconds:
         options["seconds"] = last - first
     if burnt is not None:
         options["mask"] = MASK
@@ -198,15 +199,16 @@ def write(
     return scales, None if moving_from is None else share
 
 
-def draw(found: Reconstruction, limits: Limits) -> Tensor:
+def draw(found: Reconstruction, limits: Limits, taken_by: Sequence[str] | None = None) -> Tensor:
     """Draw the capture from above (x to the right, y up) and from the side (z up): (H, 2 H, 3) in [0, 1].
 
-    Cameras go from blue to red; grey is the box.
+    Cameras go from blue to red; grey is the box. Lines join the places of one camera: of a rig, ``taken_by``
+    says which took each of the images.
     """
-    return torch.cat([_drawn(found, limits, axes) for axes in ([0, 1], [0, 2])], 1)
+    return torch.cat([_drawn(found, limits, axes, taken_by) for axes in ([0, 1], [0, 2])], 1)
 
 
-def _drawn(found: Reconstruction, limits: Limits, axes: list[int]) -> Tensor:
+def _drawn(found: Reconstruction, limits: Limits, axes: list[int], taken_by: Sequence[str] | None) -> Tensor:
     """Draw two axes of the world."""
     cameras, centers = list(found.cameras.values()), found.centers
     low, high = np.array(limits.box.low), np.array(limits.box.high)
@@ -233,8 +235,11 @@ def _drawn(found: Reconstruction, limits: Limits, axes: list[int]) -> Tensor:
     image = with_lines(image, outline, torch.tensor([_BOX]), 0.6)
     share = torch.linspace(0, 1, len(cameras))[:, None]
     paint = torch.lerp(torch.tensor([_FIRST]), torch.tensor([_LAST]), share)
-    image = with_lines(image, np.stack([centers[:-1], centers[1:]], 1), paint[:-1], 0.8)
-    every = max(1, len(cameras) // _FRUSTA)
+    whose = np.asarray(taken_by or [""] * len(cameras))
+    joined = np.flatnonzero(whose[:-1] == whose[1:])
+    if len(joined):
+        image = with_lines(image, np.stack([centers[joined], centers[joined + 1]], 1), paint[joined], 0.8)
+    every = 1 if taken_by and len({*taken_by}) == len(cameras) else max(1, len(cameras) // _FRUSTA)
     views = np.concatenate([_frustum(camera, 0.08 * span) for camera in cameras[::every]])
     return with_lines(image, views, paint[::every].repeat_interleave(8, 0), 0.6)
 
@@ -258,8 +263,6 @@ def facts_of(
     burnt: np.ndarray | None = None,
 ) -> dict:
     """Gather the numbers of ``capture.json``."""
-    camera = next(iter(found.cameras.values()))
-    lens, inner = camera.lens, ("width", "height", "fx", "fy", "cx", "cy")
     times = [frames.times[name] for name in found.cameras]
     left_out = sorted(frames.times.keys() - found.cameras.keys())
     return {
@@ -278,9 +281,7 @@ def facts_of(
         "reprojection_error": found.error if limits else None,
         "points": len(found.points),
         "sure_points": len(found.sure()),
-        "camera": {name: getattr(camera, name) for name in inner}
-        | {"k": list(lens.k) if lens else [0.0] * 3, "p": list(lens.p) if lens else [0.0] * 2}
-        | {"degrees": math.degrees(2 * math.atan(camera.width / (2 * camera.fx)))},
+        "camera": lens_facts(next(iter(found.cameras.values()))),
         # The way of the camera, where the median distance of what it sees is 1.
         "path": float(np.linalg.norm(np.diff(found.centers, axis=0), axis=1).sum()),
         "near": limits and limits.near,
@@ -290,6 +291,14 @@ def facts_of(
         "scales": scales,
         "moving": moving,
     }
+
+
+def lens_facts(camera: Camera) -> dict:
+    """Gather the size of a camera's images, its lens, and how many degrees it sees across."""
+    lens, inner = camera.lens, ("width", "height", "fx", "fy", "cx", "cy")
+    facts = {name: getattr(camera, name) for name in inner}
+    facts |= {"k": list(lens.k) if lens else [0.0] * 3, "p": list(lens.p) if lens else [0.0] * 2}
+    return facts | {"degrees": math.degrees(2 * math.atan(camera.width / (2 * camera.fx)))}
 
 
 def _places_of(mask: np.ndarray) -> list[str]:

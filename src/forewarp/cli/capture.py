@@ -1,12 +1,13 @@
 """
-forewarp-capture makes a scene from a video: it takes the sharpest frames, finds the cameras' poses from what
-stands still, and writes what experiment=video_with_poses reads (docs/capture.md).
+forewarp-capture makes a scene from a video, or from those of several cameras: it takes frames, finds the
+cameras' poses from what stands still, and writes what experiment=video_with_poses reads (docs/capture.md).
 
   forewarp-capture video=hand.mp4 out=captures/hand
   forewarp-train experiment=video_with_poses data.root=captures data.scene=hand
 
 What one types most:
   video=FILE                    a video; its rotation flag and its own time stamps are heeded
+  videos=FOLDER                 or a video of each of several cameras, which film one scene (see below)
   images=FOLDER                 or pictures of one size, in the order of their names
   colmap=FOLDER                 poses that are known: a COLMAP model, of the pictures in images=
   masks=FOLDER                  what moves is bright; poses are not found from it. A mask for each frame
@@ -21,6 +22,14 @@ What one types most:
                                 poses to be wrong
   overwrite=true                replace an earlier capture in out
 
+Several cameras, videos=FOLDER: cam00.mp4, ... of any names and rates, or a sub-folder of pictures for each
+  offsets=null                  when each began: by sound, where all have it; [0, 0.2, ...] or
+                                {cam00: 0, cam01: 0.2}, seconds; none: all together
+  without=[cam13]               leave out cameras
+  fixed=true                    the cameras stand; false: they move; null: as their images show
+  rate=30                       pictures a second, of sub-folders
+  masks=FOLDER                  with a sub-folder for each camera
+
 After Ctrl-C the same command goes on.
 """
 
@@ -31,7 +40,14 @@ from forewarp.runs.config import check_seed
 from forewarp.runs.overrides import command_line, text_override
 
 MATCHING = ("auto", "sequential", "exhaustive")
-PATHS = ("video", "images", "colmap", "masks", "out")
+PATHS = ("video", "videos", "images", "colmap", "masks", "out")
+RIG = {
+    "offsets": None,
+    "without": [],
+    "fixed": None,
+    "rate": None,
+}  # keys of several cameras, and none of them
+LEAST_HELD = 4  # cameras from which on one is held out by the command that comes next
 LENSES = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
 
 
@@ -39,25 +55,34 @@ def capture(config) -> None:
     """Make a scene, and say what was found."""
     from pathlib import Path
 
+    from omegaconf import OmegaConf
+
     source, out = check(config)
     # These load torch; mistakes have been answered before.
+    from forewarp.capture import rig, scene
     from forewarp.capture.frames import Source
     from forewarp.capture.pipeline import PICTURE, capture
     from forewarp.capture.poses import Search
-    from forewarp.capture.scene import summary
     from forewarp.progress import Counted
 
     if type(config.force) is not bool:
         raise ValueError(f"force: expected true or false, but got {config.force}")
     search = Search(config.matching, config.lens, config.features, config.seed, config.threads)
-    facts = capture(
-        Source(**source), out, search, Counted, frames=config.frames, size=config.size, force=config.force
-    )
-    for line in summary(facts):
+    options = {"frames": config.frames, "size": config.size, "force": config.force}
+    videos, held = source.pop("videos"), []
+    if videos is None:
+        facts = capture(Source(**source), out, search, Counted, **options)
+        lines = scene.summary(facts)
+    else:
+        options |= OmegaConf.to_container(OmegaConf.masked_copy(config, list(RIG)))
+        facts = rig.capture_rig(videos, out, search, Counted, masks=source["masks"], **options)
+        lines, posed = rig.summary(facts), [name for name in facts["cameras"] if name not in facts["lost"]]
+        held = [f"data.test_cameras=[{posed[0]}]"] if len(posed) >= LEAST_HELD else []
+    for line in lines:
         print(line)
     drawn = Path(out) / PICTURE
     print(f"written: {out}" + (f"; see {drawn}" if drawn.is_file() else ""))
-    where = [text_override("data.root", str(out.parent)), text_override("data.scene", out.name)]
+    where = [text_override("data.root", str(out.parent)), text_override("data.scene", out.name), *held]
     print(f"next: {command_line('train', ['experiment=video_with_poses', *where])}")
 
 
@@ -70,14 +95,24 @@ def check(config) -> tuple[dict, object]:
     from forewarp.files import check_replaceable
 
     source = {key: None if config[key] is None else Path(config[key]) for key in PATHS if key != "out"}
-    video, images = source["video"], source["images"]
-    if (video is None) == (images is None):
-        got = "both" if video else "neither"
+    video, videos, images = source["video"], source["videos"], source["images"]
+    given = [key for key in ("video", "videos", "images") if source[key] is not None]
+    if len(given) != 1:
+        got = " and ".join(given) or "none"
+        expected = "expected video=FILE, videos=FOLDER or images=FOLDER"
+        raise ValueError(f"video, videos, images: {expected}, but got {got}; set one of them")
+    if images is None and source["colmap"] is not None:
+        raise ValueError(f"colmap: expected images=FOLDER beside it, but got {given[0]}=; set images=")
+    if typed := [key for key, value in RIG.items() if videos is None and config[key] != value]:
+        raise ValueError(f"{typed[0]}: expected videos=FOLDER beside it, but got {given[0]}=; remove it")
+    if type(config.fixed) not in (bool, type(None)):
+        raise ValueError(f"fixed: expected true, false or null, but got {config.fixed}")
+    if config.rate is not None and not (type(config.rate) in (int, float) and 0 < config.rate < 1e6):
+        raise ValueError(f"rate: expected pictures a second, above 0, but got {config.rate}")
+    if isinstance(config.without, str):
         raise ValueError(
-            f"video, images: expected video=FILE or images=FOLDER, but got {got}; set one of them"
+            f"without: expected a list of names, but got {config.without}; write without=[{config.without}]"
         )
-    if video is not None and source["colmap"] is not None:
-        raise ValueError("colmap: expected images=FOLDER beside it, but got video=; set images=")
     for key, path in source.items():
         what, there = ("file", Path.is_file) if key == "video" else ("folder", Path.is_dir)
         if path is not None and not there(path):
@@ -99,7 +134,7 @@ def check(config) -> tuple[dict, object]:
     for package in ("pycolmap", "cv2"):
         if find_spec(package) is None:
             raise ImportError(f"capture: expected {package}, but got none; install forewarp[capture]")
-    out = Path(config.out or Path("captures") / (video or images).resolve().stem)
+    out = Path(config.out or Path("captures") / (video or videos or images).resolve().stem)
     if Path.cwd().is_relative_to(out.resolve()):
         raise ValueError(f"out: expected a folder to be made, but got {out}, which you are in; name another")
     for key, path in source.items():
@@ -108,7 +143,7 @@ def check(config) -> tuple[dict, object]:
             raise ValueError(
                 f"out: expected a folder that holds no inputs, but got {out} with {key}={path}; set out=..."
             )
-        if ours and key in ("images", "masks") and place.is_relative_to(ours):
+        if ours and key in ("videos", "images", "masks") and place.is_relative_to(ours):
             raise ValueError(
                 f"out: expected a folder outside {key}={path}, which is read, but got {out}; set out=..."
             )

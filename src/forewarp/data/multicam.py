@@ -39,13 +39,12 @@ from forewarp.data.images import (
     turned_by_exif,
 )
 from forewarp.data.rigs import held_cameras, held_moments, split_rig
-from forewarp.data.video import extracted, stamps_of
+from forewarp.data.video import VIDEOS, extracted, stamps_of
 from forewarp.files import written_whole
 from forewarp.scene.camera import Camera
 from forewarp.scene.frame import Frame, Scene, middle_of
 
 FILE = "poses_bounds.npy"
-_SUFFIXES = (".mp4", ".mov", ".mkv", ".avi", ".webm")
 _MOST_APART = 0.5  # frames by which two videos may run apart
 # A camera's axes down, right, backwards to OpenCV's, and back.
 _AXES = torch.tensor([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]], dtype=torch.float64)
@@ -221,7 +220,7 @@ def write_poses(folder: str | Path, cameras: Sequence[Camera], *, near: float, f
 
 def _paths(folder: Path) -> dict[str, Path]:
     """Find the video or the folder of frames of each camera, by name, in the order of numbers."""
-    found = {path.stem: path for path in folder.glob("cam*") if path.suffix.lower() in _SUFFIXES}
+    found = {path.stem: path for path in folder.glob("cam*") if path.suffix.lower() in VIDEOS}
     for path in folder.glob("cam*/"):
         inner = next((place for place in (path, path / "images") if _images(place)), None)
         found |= {} if inner is None else {path.name: inner}

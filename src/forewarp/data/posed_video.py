@@ -7,6 +7,7 @@ which may be any: the scene is normalised. The optional ``points.npy`` (N, 3), o
 holds points that never move.
 
 Beyond nerfstudio's keys a frame may have ``camera``, a name or a number of which of several cameras took it;
+``moment``, the number from 0 of the instant that it belongs to, where cameras film at times of their own;
 and ``moving_path``, a grey PNG as large as the unscaled image, bright
 where something moves, which is scored apart. ``moving_from`` says where these come from, ``seconds`` how long
 the film is.
@@ -81,7 +82,8 @@ class PosedShot:
     """An image to write: ``name`` its file, .png or .jpg; ``pixels`` uint8 (H, W, 3), or (H, W, 4) of
     straight alpha; ``camera`` of that size, its near and far are not written; ``time`` in [0, 1] or None;
     ``split`` train, val or test, or "" where the reader is to choose; ``moving`` bool (H, W), what moves, or
-    None where it is not known; ``taken_by`` the name of the camera, of a rig.
+    None where it is not known; ``taken_by`` the name of the camera, of a rig, and ``moment`` the number of
+    the instant, from 0.
     """
 
     name: str
@@ -91,6 +93,7 @@ class PosedShot:
     split: str = ""
     moving: np.ndarray | None = None
     taken_by: str | None = None
+    moment: int | None = None
 
 
 def read_scene(
@@ -128,7 +131,8 @@ def read_scene(
         test_every: every n-th frame is a test frame, the first and the last never, where the file does not
             list ``<split>_filenames``.
         test_cameras: names of the cameras held out, of frames that have ``camera``; None: see above.
-        test_moments: numbers of the times, from 0, that no camera is trained on; None: see above.
+        test_moments: numbers of the frames' moments, or without these of the times, from 0, that no camera
+            is trained on; None: see above.
         axes: of the poses in the file: opengl or opencv; None: OpenGL's, unless the cameras look away from
             what they surround, which is refused.
         inverse: poses in the file are world-to-camera.
@@ -196,10 +200,11 @@ def read_scene(
         return Frame(e.name, e.time, space.camera(e.camera), e.load, **optional)
 
     train, val, test = (tuple(map(frame, parts[split])) for split in SPLITS)
-    moments = {time: n for n, time in enumerate(sorted({*times}))}
-    held = held_cameras(test_cameras, views, []), held_moments(test_moments, len(moments))
+    ranks = {time: n for n, time in enumerate(sorted({*times}))}
+    moments = {e.name: ranks[e.time] if e.moment is None else e.moment for e in entries}
+    held = held_cameras(test_cameras, views, []), held_moments(test_moments, max(moments.values()) + 1)
     if by_name:
-        train, test = split_rig(((moments[f.time], f) for f in train), *held)
+        train, test = split_rig(((moments[f.name], f) for f in train), *held)
     if not isinstance(moving_from := content.get("moving_from", "moving_path of the frames"), str):
         raise mismatch(f"{file}: moving_from", "text", short(moving_from))
     start = (min if canonical == "first" else middle_of)([frame.time for frame in train])
@@ -262,6 +267,7 @@ class ImageEntry:
     valid: StoredMask | None = None
     moving: MovingMask | None = None
     taken_by: str | None = None
+    moment: int | None = None
 
 
 def _read_entries(
@@ -316,11 +322,16 @@ def _read_entries(
         is_cut_out = header.has_alpha and not opaque
         taken_by = entry.own.get("camera")
         taken_by = str(taken_by) if type(taken_by) in (str, int) else None  # an object is another program's
-        entries.append(ImageEntry(name, time_in(entry), camera, load, is_cut_out, valid, moving, taken_by))
+        moment = entry.own.get("moment")
+        moment = None if moment is None else whole(moment, entry.where("moment"), 0)
+        entries.append(
+            ImageEntry(name, time_in(entry), camera, load, is_cut_out, valid, moving, taken_by, moment)
+        )
     for key, given in (
         ("mask_path", has_mask),
         ("moving_path", [e.moving is not None for e in entries]),
         ("camera", [e.taken_by is not None for e in entries]),
+        ("moment", [e.moment is not None for e in entries]),
         ("file_path: alpha", [e.has_alpha or e.load.mask is not None for e in entries]),
     ):
         if any(given) and not all(given):
@@ -491,6 +502,8 @@ def _write_shot(folder: Path, shot: PosedShot, taken: set[str]) -> dict:
     entry["transform_matrix"] = opengl_rows(camera.camera_to_world, shot.name)
     if shot.taken_by is not None:
         entry["camera"] = shot.taken_by
+    if shot.moment is not None:
+        entry["moment"] = shot.moment
     write_image(folder / entry["file_path"], pixels)
     if shot.moving is not None:
         mask = np.uint8(255) * np.asarray(shot.moving, bool)

@@ -14,6 +14,7 @@ from threading import Thread
 import imageio_ffmpeg
 import numpy as np
 
+VIDEOS = (".mp4", ".mov", ".mkv", ".avi", ".webm")  # suffixes of a rig's films, in small letters
 _STAMP = re.compile(r"Parsed_showinfo.* n: *\d+ .* pts_time:(\S+)")
 _DURATION = re.compile(r"Duration: (\d+):(\d+):([\d.]+)")
 HDR = {"arib-std-b67": "HLG", "smpte2084": "PQ"}

@@ -10,7 +10,7 @@ from contextlib import suppress
 
 # Keys that hold a path, or the name of a scene's folder; those in which a list of paths may stand.
 TEXTS = re.compile(
-    r"data\.(root|scene)|paths\.\w+|plan\.folder|run2?|runs|resume|out|video|images|colmap|masks|curves|published|"
+    r"data\.(root|scene)|paths\.\w+|plan\.folder|run2?|runs|resume|out|videos?|images|colmap|masks|curves|published|"
     "lpips_weights"
 )
 LISTS = ("runs", "published", "lpips_weights")
