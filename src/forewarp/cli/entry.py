@@ -20,6 +20,7 @@ from forewarp.cli.mistakes import flat, one_line, options_last, refuse_dashes, u
 from forewarp.runs import overrides
 from forewarp.runs.config_files import configurations, installed, project_root
 from forewarp.runs.overrides import as_text, command_of_job, is_sweep, key_of
+from forewarp.runs.windows import commands_of, scores_of
 
 TRACEBACK_VARIABLE = "FOREWARP_TRACEBACK"
 MISTAKE, INTERRUPTED = 2, 130
@@ -49,8 +50,12 @@ def command(name: str, task: Callable, text: str, *, config: str | None = None) 
         if any(argument.partition("=")[0] in ("--info", "-i") for argument in sys.argv[1:]):
             logging.disable(logging.NOTSET)  # Hydra logs what it prints
             logging.raiseExceptions = False  # of a reader that closed the output
-        sys.argv[1:] = _arguments(name)
-        failures = _run(name, task, configurations(), config or name)
+        failures: list[int] = []
+        words = _arguments(name)
+        for sys.argv[1:] in commands_of(words) if name == "train" else [words]:
+            failures += _run(name, task, configurations(), config or name)
+            if any(failures):
+                break
     except KeyboardInterrupt:
         _interrupted(name)
     except BrokenPipeError:  # the reader of the output closed it
@@ -142,6 +147,7 @@ def _run(name: str, task: Callable, conf: Path, config_name: str) -> list[int]:
         try:
             quiet()  # again, as a launcher may start another process
             os.environ.update(trust)
+            overrides.constant.clear()  # of an earlier sweep of this process
             overrides.constant.update(typed_once)
             result = task(config)
         except Exception as error:
@@ -176,6 +182,8 @@ def _tell_jobs(name: str, jobs: list[tuple[int, str, str | None, str | None, flo
         print(f"{len(done)} jobs{about}:")
         for _, _, run, _, score in done:
             print(f"  {'' if score is None else f'{score:.4f}':>9}  {run}")
+        for line in scores_of(job[2] for job in done):
+            print(line)
         sys.stdout.flush()
     if failed:
         listed = "".join(f"\n  {words}" for words in failed)

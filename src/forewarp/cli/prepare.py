@@ -107,7 +107,9 @@ def prepare(config: DictConfig) -> Prepared | None:
     from forewarp.runs.fitted import Score, is_measured, named, tell
 
     named(config.get("score"))
-    run = build_run(hashed(config))
+    config = hashed(config)
+    refuse_missing_start(config)
+    run = build_run(config)
     place = run.datamodule.place
     synthetic = hasattr(run.datamodule, "prepare")  # it makes a scene that is not there
     if config.get("absent") == "skip" and not synthetic and place is not None and not place.is_dir():
@@ -153,6 +155,20 @@ def refuse_missing_scene(config: DictConfig) -> None:
     reader = READERS.get(config.data.get("_target_"))
     if reader is not None and config.get("absent", "refuse") == "refuse":
         scene_folder(Path(config.data.root).expanduser(), str(config.data.scene), reader)
+
+
+def refuse_missing_start(config: DictConfig) -> None:
+    """Refuse a run that begins from another one which is not finished, or by a method that cannot."""
+    start = config.get("start")
+    if start is None:
+        return
+    if not str(config.model.get("_target_")).startswith(PARTICLES):
+        raise ValueError(f"start: expected model=particles beside it, but got model={config.model.name}")
+    if not any(Path(config.run).glob("*/last.ckpt")) and not any(Path(start).glob("*/done.json")):
+        raise ValueError(
+            f"start: expected a finished run of what stands still, but got none in {start}; make it by the "
+            "same command with windows=still, without data.window and start"
+        )
 
 
 def refuse_seeds(config: DictConfig) -> None:

@@ -37,6 +37,8 @@ What one types most (beside options such as --multirun or --config-dir=FOLDER):
   dataset=dnerf data.scene=hook       a scene of a dataset below paths.scenes=FOLDER, here FOLDER/dnerf/hook
   ablation=NAME                       an ablation of the paper; ablation=full is its whole method
   logger=tensorboard|csv|wandb|mlflow|none   where curves and scores go; several: logger=[tensorboard,mlflow]
+  windows=N                           a long film in N parts that share what stands still, one after another,
+                                      or at once with launcher=joblib; the same as windows=still, then =each
   launcher=local|joblib|ray|slurm|submitit   where the jobs of --multirun run
   ~stage.fine                         drop a stage
   --multirun seeds=3                  one run after another; --multirun sweeps=dnerf: a prepared sweep

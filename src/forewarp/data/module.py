@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from functools import cached_property, partial
 from inspect import signature
@@ -18,6 +18,7 @@ from forewarp.data.checks import check_seen
 from forewarp.data.files import RECORD, fingerprint, mismatch, whole
 from forewarp.data.films import STORE, films_of
 from forewarp.data.images import CACHE
+from forewarp.data.windows import cut
 from forewarp.scene.frame import Scene, Truth, middle_of, spread
 from forewarp.scene.view import Target
 
@@ -183,6 +184,7 @@ class SceneDataModule(LightningDataModule):
         held_out: training frames that are never trained on (``hold_out``).
         train_views: most training frames to train on, of those that are left (``only``); None: all.
         canonical: another canonical time than the format's own (None): see ``with_canonical``.
+        window: the part of a long film that is trained and measured; None: all of it. See ``cut``.
         place: the scene's folder, where it has one.
     """
 
@@ -208,6 +210,7 @@ class SceneDataModule(LightningDataModule):
         held_out: int = 0,
         train_views: int | None = None,
         canonical: str | float | None = None,
+        window: Sequence[float] | None = None,
         place: str | Path | None = None,
     ) -> None:
         super().__init__()
@@ -215,13 +218,15 @@ class SceneDataModule(LightningDataModule):
         self._read, self.cache_bytes, self.held_out = read, cache_bytes, held_out
         self.disk_cache_bytes, self.frames_folder = disk_cache_bytes, None
         self._canonical, self._eval_background, self._train_views = canonical, eval_background, train_views
+        self._window = window
         self._draw = {"rays": rays, "background": background, "seed": seed, "views_per_step": views_per_step}
 
     @cached_property
     def scene(self) -> Scene:
         """The scene; its protocol names the background that it is measured on."""
         self._bound_caches()
-        scene = hold_out(with_canonical(self._read(), self._canonical), self.held_out)
+        scene = cut(self._read(), self._window)
+        scene = hold_out(with_canonical(scene, self._canonical), self.held_out)
         scene = only(scene, self._train_views)
         check_seen(scene)
         protocol = {**scene.protocol, "background": self._background(scene) if scene.has_alpha else "none"}

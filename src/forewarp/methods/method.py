@@ -32,6 +32,8 @@ class Start:
         blank: a checkpoint is about to be loaded: build parts of the right shape only, from no image and
             no earlier stage.
         weights, literal, photo_on: see ``Objective``.
+        shares: the run began from another run's method (``before``, in the first stage), which others begin
+            from, too.
     """
 
     scene: Scene
@@ -44,6 +46,7 @@ class Start:
     weights: Mapping[str, float] = field(default_factory=dict)
     literal: Sequence[str] = ()
     photo_on: Sequence[str] | None = None
+    shares: bool = False
 
 
 @dataclass(frozen=True)

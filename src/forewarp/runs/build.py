@@ -16,10 +16,13 @@ from omegaconf import DictConfig, OmegaConf
 
 from forewarp.clock import Clock
 from forewarp.data.films import FOLDER
-from forewarp.runs.config import IDENTITY, instead_of
+from forewarp.runs.config import IDENTITY, instead_of, saved_config, trust_of
 from forewarp.runs.overrides import TEXTS, key_of
+from forewarp.scene.cloud import Handover
 from forewarp.training.callbacks import StageProgress
+from forewarp.training.checkpoints import load_handover
 from forewarp.training.loggers import RunLoggers
+from forewarp.training.module import DynamicSceneModule
 from forewarp.training.schedule import StagePlan, seconds_after, share_out
 from forewarp.training.stages import Run
 
@@ -85,6 +88,7 @@ def build_run(config: DictConfig) -> Run:
         clock=Clock(config.budget.clock).kind,
         place=device,
         loggers=loggers_of(config),
+        start=start_of(config),
     )
     run.check()
     return run
@@ -102,6 +106,19 @@ def frames_folder(config: DictConfig) -> Path:
     above = list(run.parents[:_LEVELS])
     known = (folder for folder in above if (folder / FOLDER).is_dir() and not (folder / FOLDER).is_symlink())
     return next(known, runs if runs in above else run.parent) / FOLDER
+
+
+def start_of(config: DictConfig) -> Callable[[], tuple[DynamicSceneModule, Handover]] | None:
+    """Return what opens the run that ``start`` names; None where a run begins from images."""
+    if config.get("start") is None:
+        return None
+    changes = OmegaConf.create({"trust": list(trust_of(config.get("trust")))})
+
+    def opened() -> tuple[DynamicSceneModule, Handover]:
+        run = build_run(saved_config(str(config.start), changes, "start"))
+        return run.load(), load_handover(run.stage_folder(run.stages[-1]))
+
+    return opened
 
 
 def loggers_of(config: DictConfig) -> RunLoggers:

@@ -124,7 +124,7 @@ def in_words(overrides: Sequence[str]) -> str:
         first, *others = re.split(r"[./]", key)
         name = "-".join(dict.fromkeys([*others[: first in ("stage", "objective")], *others[-1:]])) or first
         if first in (*IDENTITY, "ablation", "capture") and key not in _NAMED and value != "null":
-            word = f"without-{name}" if override.startswith("~") else f"{name}-{value}"
+            word = f"without-{name}" if override.startswith("~") else f"{name}-{value.strip('[]')}"
             words.append(re.sub(r"[^\w.-]+", "_", word).strip("-_."))
     while len(words) > 1 and len("-".join(words)) > 60:
         words.pop()
@@ -135,6 +135,8 @@ def content_hash(config: DictConfig, more: Sequence[str] = (), *others: object) 
     """Return ten digits of a SHA-256 of ``IDENTITY`` and ``more`` keys of a config, and of ``others``."""
     make_absolute(config)
     content = {key: config.get(key) for key in (*IDENTITY, *more)}
+    if config.get("start") is not None:
+        content["start"] = config.start
     for key, part in content.items():
         if OmegaConf.is_config(part):
             content[key] = OmegaConf.to_container(part, resolve=True)
@@ -282,7 +284,9 @@ def refuse_to_synthesize(config: DictConfig) -> None:
 
 
 def make_absolute(config: DictConfig) -> None:
-    """Make ``data.root`` absolute, as a run may be evaluated from another folder."""
+    """Make ``data.root`` and ``start`` absolute, as a run may be evaluated from another folder."""
+    if config.get("start") is not None:
+        config.start = str(Path(config.start).expanduser().resolve())
     if not OmegaConf.is_missing(config.data, "root") and config.data.get("root") is not None:
         config.data.root = str(Path(config.data.root).expanduser().resolve())
 

@@ -10,8 +10,8 @@ from contextlib import suppress
 
 # Keys that hold a path, or the name of a scene's folder; those in which a list of paths may stand.
 TEXTS = re.compile(
-    r"data\.(root|scene)|paths\.\w+|plan\.folder|run2?|runs|resume|out|videos?|images|colmap|masks|curves|published|"
-    "lpips_weights"
+    r"data\.(root|scene)|paths\.\w+|plan\.folder|run2?|runs|resume|start|out|videos?|images|colmap|masks|curves|"
+    "published|lpips_weights"
 )
 LISTS = ("runs", "published", "lpips_weights")
 constant: set[str] = set()  # keys that were typed with one value, which tell no jobs of a sweep apart

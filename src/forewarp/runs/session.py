@@ -123,7 +123,8 @@ def claim(config: DictConfig, *, finished: bool = False) -> None:
 
 def _refuse_another(path: Path, stored: DictConfig, config: DictConfig) -> None:
     """Refuse a config that describes another run than the one stored at ``path``; name a differing key."""
-    before, now = ({k: OmegaConf.to_container(c).get(k) for k in IDENTITY} for c in (stored, config))
+    keys = (*IDENTITY, "start")
+    before, now = ({k: OmegaConf.to_container(c).get(k) for k in keys} for c in (stored, config))
     for part in (before["data"], now["data"]):
         (part or {}).pop(NOT_OF_RUN, None)
     if differ := list(_differences(before, now)):

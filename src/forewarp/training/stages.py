@@ -59,6 +59,8 @@ class Run:
         clock: what minutes are of: see ``Clock``.
         place: gives the device that its trainers compute on.
         loggers: its loggers; whoever fits the run closes them (``with run.loggers``).
+        start: gives the fitted module of another run, from which the first stage begins, and what it left;
+            None: the first stage begins from images.
     """
 
     datamodule: lightning.LightningDataModule
@@ -74,6 +76,7 @@ class Run:
     clock: str = "wall"
     place: Callable[[], torch.device] = lambda: torch.device("cpu")
     loggers: RunLoggers = field(default_factory=RunLoggers)
+    start: Callable[[], tuple[DynamicSceneModule, Handover]] | None = None
 
     @property
     def device(self) -> torch.device:
@@ -122,6 +125,8 @@ class Run:
             lightning.seed_everything(self.seed + number, verbose=False)
             self.datamodule.restart(number)
             blank = done or (folder / "last.ckpt").is_file()
+            if number == 0 and self.start is not None and not blank:
+                module, handover = self.start()
             clock = Clock(self.clock)
             with clock.running():  # a hull, a plane sweep
                 module = self._module(stage, module, handover, blank=blank)
@@ -220,6 +225,7 @@ class Run:
             objective.weights,
             objective.literal,
             objective.photo_on,
+            self.start is not None,
         )
         method = (stage.model or self.model)(start)
         return DynamicSceneModule(

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from forewarp.methods.particles.shared import left_alone
 from forewarp.methods.rows import take_rows
 from forewarp.ops.gaussians import moved, rotations
 
@@ -56,11 +57,11 @@ def control(particles: Particles, progress: float, optimizer: torch.optim.Optimi
     renew(particles, round(float(particles.final_count) * stage.share_at(progress)), optimizer)
     if particles.nodes is not None and int(particles.round) % stage.relink == 0:
         particles.skinning.relink(particles.nodes, particles.means.data, optimizer)
-        if particles.resting is not None:
-            particles.skinning.release(particles.resting)
-            if progress >= stage.rest_from:
-                least = max(particles.least_motion, pixel_width(float(particles.covered_pixels)))
-                come_to_rest(particles, least * float(particles.extent))
+        if (still := left_alone(particles.shared, particles.resting)) is not None:
+            particles.skinning.release(still)
+        if particles.resting is not None and progress >= stage.rest_from:
+            least = max(particles.least_motion, pixel_width(float(particles.covered_pixels)))
+            come_to_rest(particles, least * float(particles.extent))
 
 
 @torch.no_grad()
@@ -70,8 +71,12 @@ def renew(particles: Particles, target: int, optimizer: torch.optim.Optimizer) -
     A particle goes whose opacity has faded, that is longer than a good part of the scene, that stood too near
     to a camera (``unseen_rounds`` is infinite), or, once all times are in play, that no image has shown for
     some rounds. The rest is split along its longest axis, in the order of its mean gradient over the images
-    that showed it, until there are ``target``.
+    that showed it, until there are ``target``. Those that are shared with other windows neither go, nor are
+    they split or counted.
     """
+    shared = torch.zeros_like(particles.unseen_rounds, dtype=torch.bool)
+    if particles.shared is not None:
+        shared = particles.shared >= 0
     gone = particles.unseen_rounds.isinf()
     particles.unseen_rounds.copy_(torch.where(particles.image_count > 0, 0.0, particles.unseen_rounds + 1))
     gone |= most_opaque(particles) < _FADED
@@ -80,10 +85,12 @@ def renew(particles: Particles, target: int, optimizer: torch.optim.Optimizer) -
         first, last = particles.nodes.seen_times.tolist()
         if first <= particles.ends[0] + 0.02 and last >= particles.ends[1] - 0.02:
             gone |= particles.unseen_rounds >= _UNSEEN
+    gone &= ~shared
     kept = (~gone).nonzero()[:, 0]
     if not len(kept):  # all that there is must not vanish
         kept = torch.arange(len(gone), device=gone.device)
-    room = min(target - len(kept), int(_MOST_A_ROUND * len(kept)) + 1)
+    own = len(kept) - int(shared.sum())
+    room = min(target - own, int(_MOST_A_ROUND * own) + 1)
     gradient = (particles.gradient_sum / particles.image_count.clamp(min=1))[kept]
     split = kept[gradient.topk(max(0, min(room, int((gradient > 0).sum())))).indices]
     fresh = torch.arange(len(kept) + len(split), device=kept.device) >= len(kept)
@@ -177,7 +184,8 @@ def come_to_rest(particles: Particles, least: float) -> None:
     times = torch.linspace(*particles.ends, _TIMES).tolist()
     nodes.stop(nodes.motion_range(times) < least, times)
     follows = particles.skinning.weights() > _FOLLOWS
-    free = ~(follows & ~nodes.stopped[particles.skinning.links.long()]).any(-1) & ~particles.resting
+    still = left_alone(particles.shared, particles.resting)
+    free = ~(follows & ~nodes.stopped[particles.skinning.links.long()]).any(-1) & ~still
     if not bool(free.any()):
         return
     at_times = zip(*(moved(particles.means.data, particles.warp(time)) for time in times))

@@ -18,6 +18,7 @@ from forewarp.methods.method import Method, Snapshot, Start, Step
 from forewarp.methods.particles import density, queries
 from forewarp.methods.particles.nodes import Nodes, Skinning, TimeOffsets, are_rows
 from forewarp.methods.particles.options import EFFECTS, Effects, Numbers, ParticlesPlanning, view_share
+from forewarp.methods.particles.shared import begin_window
 from forewarp.methods.particles.start import (
     compile_kernels,
     covered_pixels,
@@ -41,7 +42,7 @@ from forewarp.scene.view import Asks, Batch, Moment, Observation
 _FEWEST_TIMES = 8  # of training, for learned corrections of them
 # Parameters and buffers with a row for each particle; those of effects that are off are None.
 _ROWS = ("means", "scales", "quaternions", "opacity", "colors", "sh", "color_over_time", "opacity_over_time")
-_ROWS += ("gradient_sum", "image_count", "unseen_rounds", "resting")
+_ROWS += ("gradient_sum", "image_count", "unseen_rounds", "resting", "shared")
 
 
 class ParticlesSnapshot(GaussiansSnapshot, Snapshot):
@@ -122,19 +123,24 @@ class Particles(Method):
         self.least_motion = effects.background
         resting = None if effects.background is None else torch.zeros(count, dtype=torch.bool)
         self.register_buffer("resting", resting)
+        # Rows of the run that windows of a film begin from: particles that stay as they are; -1: of its own.
+        self.register_buffer("shared", values.get("shared"))
 
         self.nodes = self.skinning = None
         if effects.motion is not None:
-            nodes, knots = self.stage.motion(count, len(times))
+            own = self.means.data if self.shared is None else self.means.data[self.shared < 0]
+            nodes, knots = self.stage.motion(len(own), len(times))
             natural = self.stage.natural_splines
             curve = Curve(effects.motion, knots, len(times), self.canonical_time, straight=natural)
             offsets = None  # cosines are exactly 0 at the canonical time, and few times do not tell
             if self.stage.time_offsets and effects.motion == "spline" and len(times) >= _FEWEST_TIMES:
                 offsets = TimeOffsets(times, self.stage.time_offsets)
-            points, edges = None if start.blank else self.means.data, self.stage.edges
+            points, edges = None if start.blank else own, self.stage.edges
             rotates, rests = effects.rotation is not None, effects.background is not None
             self.nodes = Nodes(points, nodes, curve, offsets, rotates=rotates, rests=rests, edges=edges)
             self.skinning = Skinning(self.nodes, self.means.data)
+            if self.shared is not None:
+                self.skinning.release(self.shared >= 0)
         self.grows = tuple(name for name in _ROWS if getattr(self, name) is not None)
         self.grows += () if self.skinning is None else Skinning.ROWS
 
@@ -142,15 +148,23 @@ class Particles(Method):
         """Return the first value of every parameter: fresh, or of the stage before.
 
         Also register ``covered_pixels``: mean number of pixels of an image that show anything; ``extent``:
-        median distance of points from the middle; and ``final_count``: how many particles there will be.
+        median distance of points from the middle; and ``final_count``: how many particles there will be,
+        beside those that are ``shared``, then of the ``moving_pixels``.
         """
+        moving = 1.0
         if isinstance(start.before, Particles):
             before = start.before
             covered, extent = float(before.covered_pixels), float(before.extent)
-            values = {n: p.data.to("cpu", copy=True) for n, p in before.named_parameters(recurse=False)}
+            if start.shares and before.shared is None:
+                values, moving = begin_window(before, start, self.stage.initial_share)
+            else:
+                values = {n: p.data.to("cpu", copy=True) for n, p in before.named_parameters(recurse=False)}
+                if before.shared is not None:
+                    values["shared"], moving = before.shared.to("cpu", copy=True), float(before.moving_pixels)
         elif start.blank:
             covered = extent = 1.0
             values = first_values(Cloud(torch.zeros(1, 3), torch.zeros(1, 3), torch.zeros(1), 1.0))
+            values |= {"shared": torch.tensor([-1])} if start.shares else {}
         else:
             covered = covered_pixels(start.scene, list(start.frames))
             count = round(self.stage.initial_share * self.stage.final_count(covered, self.views))
@@ -162,7 +176,8 @@ class Particles(Method):
             values = first_values(cloud, widest)
         self.register_buffer("covered_pixels", torch.tensor(covered))
         self.register_buffer("extent", torch.tensor(extent))
-        final_count = float(self.stage.final_count(covered, self.views))
+        self.register_buffer("moving_pixels", torch.tensor(moving) if start.shares else None)
+        final_count = float(self.stage.final_count(moving if start.shares else covered, self.views))
         self.register_buffer("final_count", torch.tensor(final_count))
         return values
 
@@ -295,8 +310,11 @@ class Particles(Method):
         )  # fmt: skip
         terms = {"depth": compared.depth} | (terms or {"photo": compared.loss})
         terms = {name: value / covered for name, value in terms.items()}
-        shown = compared.pixel_gradient > 0
-        self.gradient_sum.add_(compared.pixel_gradient)
+        by_place = compared.pixel_gradient
+        if self.shared is not None:
+            by_place = by_place.masked_fill(self.shared >= 0, 0.0)
+        shown = by_place > 0
+        self.gradient_sum.add_(by_place)
         self.image_count.add_(shown)
         self.shown_now.append(shown)
         if self.progress < self.stage.density_until:
@@ -314,6 +332,9 @@ class Particles(Method):
             smooth, extent = factors.get("smooth", 0.0), float(self.extent)
             terms["smooth"], of_nodes = nodes.backward(time, motion_time, basis, by_motion, smooth, extent)
             gradients |= {"skinning.logits": compared.skin, **of_nodes}
+        if self.shared is not None:
+            for name in gradients.keys() & {*self.grows}:
+                gradients[name][self.shared >= 0] = 0.0  # the optimiser passes over them
         return compared.squared, terms, gradients
 
     def _image_loss(self, factors: Mapping[str, float], terms: dict[str, float]) -> Callable | None:

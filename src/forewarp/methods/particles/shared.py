@@ -1,0 +1,110 @@
+"""Where a window of a long film begins: what stands still in all of it, as another run has found, and points
+on what moves.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from forewarp.methods.method import Start
+from forewarp.methods.particles.start import first_points, first_values, widths
+from forewarp.ops.grid import dilate
+from forewarp.scene.frame import Frame, Scene, sightings, spread
+from forewarp.scene.view import Moment, View
+
+if TYPE_CHECKING:
+    from forewarp.methods.particles.model import Particles
+
+_MOMENTS, _CAMERAS = 6, 12  # at which, and by how many cameras of each, it is looked at what moves
+_WRONG = 0.05, 0.15  # error from which on a pixel is wrong: thrice its image's mean, but at least and at most
+_GROWN = 0.01  # share of an image's width by which what is wrong is enlarged
+_MOVES, _NEW = (
+    0.5,
+    0.75,
+)  # share of a moment's views that show a place wrongly: it moves; a new point is on it
+_POINTS = 4096  # tried on what moves
+_FEW = 16  # particles that are too few to move
+
+
+@torch.no_grad()
+def begin_window(still: Particles, start: Start, share: float) -> tuple[dict[str, Tensor], float]:
+    """Return the first values of a window's particles, and how many pixels of an image show what moves.
+
+    First come those of ``still``, then new ones on what moves at the canonical time. ``shared`` (N,) int64
+    holds the row in ``still`` of those that the window leaves as they are, else -1.
+
+    Args:
+        still: fitted to all of the film, at rest.
+        start: of the window.
+        share: of the number that the moving pixels ask for, which new particles may be.
+
+    Cost: some 70 images are rendered; and that of ``first_points``.
+    """
+    scene, means = start.scene, still.means.data
+    own, pixels = torch.zeros(len(means), dtype=torch.bool), []
+    for frames in moments_of(scene):
+        masks = [wrong_pixels(still, frame) for frame in frames]
+        wrong, seen = sightings(means, [frame.camera for frame in frames], masks)
+        own |= (seen > 0) & (wrong >= _MOVES * seen)
+        pixels += [float(mask.sum()) for mask in masks]
+    if int(own.sum()) < _FEW:
+        own[:_FEW] = True
+    moving_pixels = max(sum(pixels) / len(pixels), float(_FEW))
+    values = {name: p.data.to("cpu", copy=True) for name, p in still.named_parameters(recurse=False)}
+    fresh = _on_what_moves(still, start, round(share * still.stage.final_count(moving_pixels, still.views)))
+    if fresh:
+        count = len(fresh["means"])
+        fresh |= {n: v.new_zeros(count, *v.shape[1:]) for n, v in values.items() if n not in fresh}
+        values = {name: torch.cat([value, fresh[name]]) for name, value in values.items()}
+        own = torch.cat([own, torch.ones(count, dtype=torch.bool)])
+    values["shared"] = torch.where(own, -1, torch.arange(len(own)))
+    return values, moving_pixels
+
+
+def _on_what_moves(still: Particles, start: Start, count: int) -> dict[str, Tensor]:
+    """Make at most ``count`` particles where images of the canonical time show ``still`` to be wrong."""
+    scene = start.scene
+    cloud = first_points(replace(start, handover=None), _POINTS)
+    now = [frame for frame in scene.train if frame.time == scene.canonical_time]
+    now = [now[i] for i in spread(len(now), _CAMERAS)]
+    masks = [wrong_pixels(still, frame) for frame in now]
+    wrong, seen = sightings(cloud.points, [frame.camera for frame in now], masks)
+    rows = ((seen > 0) & (wrong >= _NEW * seen)).nonzero()[:, 0]
+    if not len(rows):
+        return {}
+    cloud = cloud[rows[spread(len(rows), max(count, 1))]]
+    area = sum(float(mask.sum()) for mask in masks) / len(masks)
+    return first_values(cloud, widths(scene, cloud.points, max(area, 1.0)))
+
+
+def moments_of(scene: Scene) -> list[list[Frame]]:
+    """Return training frames of some moments, evenly spread: those of some cameras of each."""
+    times = [scene.times[i] for i in spread(len(scene.times), _MOMENTS)]
+    moments = [[frame for frame in scene.train if frame.time == time] for time in times]
+    return [[frames[i] for i in spread(len(frames), _CAMERAS)] for frames in moments]
+
+
+@torch.no_grad()
+def wrong_pixels(still: Particles, frame: Frame) -> Tensor:
+    """Return which pixels (H, W) of an image ``still`` does not show, and what is beside them."""
+    rgba = frame.load().float() / 255
+    view, black = View(frame.camera), torch.zeros(3)
+    drawn = still.at(Moment(frame.time, camera=frame.camera_id)).render(view, black).rgb
+    height, width = frame.camera.height, frame.camera.width
+    error = (drawn.reshape(height, width, 3) - rgba[..., :3] * rgba[..., 3:]).abs().mean(-1)
+    smooth = torch.nn.functional.avg_pool2d(error[None, None], 3, 1, 1, count_include_pad=False)[0, 0]
+    wrong = smooth > (3 * error.mean()).clamp(*_WRONG)
+    if frame.load_valid is not None:
+        wrong &= frame.load_valid()
+    return dilate(wrong, max(1, round(_GROWN * width)))
+
+
+def left_alone(shared: Tensor | None, resting: Tensor | None) -> Tensor | None:
+    """Return which particles (N,) follow no node: those shared, and those at rest; None where none can."""
+    if shared is None or resting is None:
+        return resting if shared is None else shared >= 0
+    return (shared >= 0) | resting

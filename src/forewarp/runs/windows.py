@@ -1,0 +1,89 @@
+"""``windows=N``: a long film in parts, by two commands; and how they did together."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from statistics import fmean
+
+from forewarp.files import read_json
+from forewarp.runs.overrides import is_sweep, key_of, text_override
+
+_MOST = 1000
+_SHOWS = ("--cfg", "-c", "--info", "-i", "--hydra-help", "--shell-completion", "-sc")  # no run
+_SHOWN = ("psnr", "ssim", "ms_ssim", "lpips_vgg", "lpips_alex", "lpips_squeeze")  # of the metrics, if there
+
+
+def commands_of(arguments: Sequence[str]) -> list[list[str]]:
+    """Return the command lines that one with ``windows=N`` stands for; any other stands for itself.
+
+    First comes what stands still in all of the film, then a sweep over its windows, each of which begins from
+    it. ``run=FOLDER`` is the folder of all of them.
+
+    Raises:
+        ValueError: for a number of windows that there cannot be, or a window beside it.
+
+    >>> for line in commands_of(["windows=2", "seed=1"]):
+    ...     print(*line)
+    windows=still seed=1 --multirun
+    windows=each data.window=[0,0.5],[0.5,1] seed=1 --multirun
+    """
+    keys = [key_of(argument) for argument in arguments]
+    if "windows" not in keys:
+        return [list(arguments)]
+    value = arguments[keys.index("windows")].partition("=")[2]
+    if value in ("still", "each", "null"):
+        return [list(arguments)]
+    if not value.isdecimal() or not 2 <= int(value) <= _MOST:
+        raise ValueError(
+            f"windows: expected a whole number from 2 to {_MOST}, still or each, but got {value}"
+        )
+    if typed := {"data.window", "start"} & {*keys}:
+        raise ValueError(
+            f"{typed.pop()}: expected none beside windows={value}; leave it out, or windows=each"
+        )
+    others = [one for one, key in zip(arguments, keys) if key not in ("windows", "run", "-m", "--multirun")]
+    for one, key in zip(arguments, keys):
+        if key != "seed" and not one.startswith("-") and is_sweep(one):
+            raise ValueError(f"{key}: expected one value beside windows={value}, but got several; choose one")
+    folder = next((one.partition("=")[2] for one, key in zip(arguments, keys) if key == "run"), None)
+    is_shown = any(one.partition("=")[0] in _SHOWS for one in others)  # the config, of the first window
+    limits = f"[0,{1 / int(value):.6g}]" if is_shown else _limits(int(value))
+    still, each = ["windows=still"], ["windows=each", f"data.window={limits}"]
+    if folder is not None:
+        folder = folder.strip("'\"")
+        still.append(text_override("run", f"{folder}/still"))
+        each += [text_override("run", f"{folder}/{{hash}}"), text_override("start", f"{folder}/still")]
+    if is_shown:
+        return [[*each, *others]]
+    return [[*first, *others, "--multirun"] for first in (still, each)]
+
+
+def _limits(count: int) -> str:
+    """Write where the windows begin and end, as Hydra takes a choice of several."""
+    ends = [f"{number / count:.6g}" for number in range(count + 1)]
+    return ",".join(f"[{begin},{end}]" for begin, end in zip(ends, ends[1:]))
+
+
+def scores_of(folders: Iterable[str | Path]) -> list[str]:
+    """Return a table of the scores of a film's windows, in their order, and of all test views of all windows;
+    nothing where fewer than two of the runs are windows.
+    """
+    windows = []
+    for folder in map(Path, folders):
+        protocol = (read_json(folder / "metrics.json") or {}).get("protocol", {})
+        views = (read_json(folder / "per_image.json") or {}).get("images", [])
+        if protocol.get("window") and views:
+            windows.append((*protocol["window"], [view["scores"] for view in views]))
+    if len(windows) < 2:
+        return []
+    windows.sort(key=lambda window: window[:2])
+    rows = [(f"{begin:.4g} to {end:.4g}", scores) for begin, end, scores in windows]
+    rows.append(("all", [score for _, _, scores in windows for score in scores]))
+    names = [name for name in _SHOWN if all(name in score for score in rows[-1][1])]
+    width = max(len(label) for label, _ in rows)
+    lines = [f"{len(windows)} windows of a film, means over their test views:"]
+    for label, scores in rows:
+        means = "  ".join(f"{name} {fmean(score[name] for score in scores):.4f}" for name in names)
+        lines.append(f"  {label:<{width}}  {len(scores):>4} views  {means}")
+    return lines

@@ -1,0 +1,37 @@
+"""A long film in windows, by one command."""
+
+import json
+from pathlib import Path
+
+import pytest
+import yaml
+
+from forewarp.synth.scenes import synthesize
+
+SHORT = ["trainer=cpu", "threads=1", "budget.minutes=null", "budget.iterations=8", "logger=none", "sheets=0"]
+SCENE = ["data=dnerf", "data.root=.", "data.scene=vehicle", "callbacks.accuracy=null"]
+
+
+@pytest.mark.slow
+def test_windows_begin_from_what_stands_still_and_are_found_again(ok, refused, in_tmp):
+    synthesize(Path("vehicle"), size=16, frames=12, samples_per_pixel=1, test_views=(4, 2, 1), val_views=0)
+    missing = refused("train", *SHORT, *SCENE, "windows=each", "data.window=[0,0.5]")
+    assert "start: expected a finished run of what stands still, but got none in" in missing
+    assert "windows=still" in missing
+    words = ["train", *SHORT, *SCENE, "windows=2", "run=film"]
+    done = ok(*words)
+    still, *windows = sorted(Path("film").iterdir())
+    assert (still.name, [place.name[:12] for place in windows]) == ("still", ["window-0.5_1", "window-0_0.5"])
+    assert not list(still.glob("coarse"))
+    views = [len(json.loads((place / "per_image.json").read_text())["images"]) for place in windows]
+    assert sum(views) == 7, views
+    assert done.out.splitlines()[-1].startswith("  all")
+    assert "7 views" in done.out.splitlines()[-1]
+    config = yaml.safe_load((windows[0] / "config.yaml").read_text())
+    assert (config["start"], config["data"]["window"]) == (str(still.resolve()), [0.5, 1])
+    again = ok(*words)
+    assert again.out.count("measured before") == 2
+    other = refused("train", *SHORT, *SCENE, "windows=2", "run=film", "seed=1")
+    assert "seed: expected 0, as the run that this folder holds, but got 1" in other
+    wrong = refused("train", *SHORT, *SCENE, "start=film/still", "model=forward", "preset=demo")
+    assert wrong == "start: expected model=particles beside it, but got model=forward"

@@ -1,0 +1,94 @@
+"""Windows of a film begin from what stands still in all of it, and leave that as it is."""
+
+import pytest
+import torch
+
+from forewarp.methods.method import Start
+from forewarp.methods.particles import density
+from forewarp.methods.particles.model import Particles
+from forewarp.methods.particles.shared import left_alone, wrong_pixels
+from tests.support.particles import BARE, EVERY, look, module_with, small_data
+
+DATA = small_data()
+
+
+def begun(before, *, blank=False, **effects):
+    """The method of a window, from a method of another run or of the stage before."""
+    frames = list(range(len(DATA.scene.train)))
+    start = Start(DATA.scene, "fine", {}, frames, None, before, blank, shares=True)
+    return Particles(start, **EVERY | effects)
+
+
+@pytest.fixture(scope="module")
+def still():
+    """Particles at rest, most of which lie where nothing ever moves."""
+    method = module_with(DATA, **BARE).method
+    method.means.data[20:] += torch.tensor([0.0, 0.0, 9.0])
+    return method
+
+
+@pytest.fixture
+def window(still):
+    module = module_with(DATA, **EVERY)
+    module.method = begun(still)
+    return module
+
+
+def test_a_window_keeps_what_stands_still_and_adds_particles_on_what_moves(still, window):
+    method = window.method
+    kept = method.shared >= 0
+    assert 10 < int(kept.sum()) < len(method.means)
+    assert torch.equal(method.means[kept], still.means[method.shared[kept]])
+    assert torch.equal(method.opacity[kept], still.opacity[method.shared[kept]])
+    assert not bool(method.skinning.shares[kept].any())
+    assert bool((method.skinning.shares[~kept].sum(-1) > 0.99).all())
+    own = {tuple(row) for row in method.means[~kept].tolist()}
+    assert {tuple(row) for row in method.nodes.positions.tolist()} <= own  # nodes follow what moves
+    assert int((~kept).sum()) > int((still.means[:, 2] < 5).sum())  # some are new
+    assert 16 <= float(method.moving_pixels) < 400
+
+
+def test_training_changes_nothing_of_what_is_shared(still, window):
+    method, optimizer = window.method, window.configure_optimizers()
+    for index in (0, 2, 4):
+        step = look(window, DATA, index)
+        for name, p in method.named_parameters():
+            p.grad = step.gradients.get(name)
+        optimizer.step()
+    density.renew(method, 2 * len(method.means), optimizer)
+    method.resting[0] = True
+    density.come_to_rest(method, 1e-4)
+    method.skinning.relink(method.nodes, method.means.data, optimizer)
+    kept = method.shared >= 0
+    rows = method.shared[kept]
+    for name in ("means", "scales", "quaternions", "opacity", "colors"):
+        assert torch.equal(getattr(method, name)[kept], getattr(still, name)[rows]), name
+    assert not bool(method.color_over_time[kept].any())
+    assert len(rows.unique()) == len(rows)
+    method.skinning.release(left_alone(method.shared, method.resting))
+    assert torch.equal(method.ellipsoids(1.0).centers[kept], method.means[kept])
+
+
+def test_the_next_stage_and_a_checkpoint_know_what_is_shared(window):
+    method = window.method
+    after = begun(method)
+    assert torch.equal(after.shared, method.shared)
+    assert float(after.moving_pixels) == float(method.moving_pixels)
+    assert float(after.final_count) == after.stage.final_count(float(method.moving_pixels), after.views)
+    loaded = begun(None, blank=True)
+    assert loaded.misfit(method.state_dict()) is None
+    loaded = module_with(DATA, **EVERY)
+    loaded.method = begun(None, blank=True)
+    state = {f"method.{name}": value for name, value in method.state_dict().items()}
+    loaded.load_state_dict(state | {k: v for k, v in loaded.state_dict().items() if k not in state})
+    assert torch.equal(loaded.method.shared, method.shared)
+    assert "shared" not in dict(module_with(DATA, **EVERY).method.named_buffers())
+
+
+def test_pixels_are_wrong_where_an_image_shows_something_else():
+    method = module_with(DATA, **BARE).method
+    method.opacity.data.fill_(-9.0)  # nothing is drawn
+    frame = DATA.scene.train[0]
+    wrong, shown = wrong_pixels(method, frame), frame.load()[..., 3] > 127
+    assert bool(wrong[shown].all())
+    assert int(wrong.sum()) < 4 * int(shown.sum())
