@@ -1,4 +1,4 @@
-"""Depth that a sensor measured, beside a scene's images."""
+"""Depth that a sensor measured or another program guessed, beside a scene's images."""
 
 from __future__ import annotations
 
@@ -16,10 +16,11 @@ from forewarp.data.images import CACHE, by, read_gray16, read_image
 from forewarp.scene.camera import Camera, Lens
 from forewarp.scene.frame import spread
 
-SUFFIXES = (".npy", ".png")
+SUFFIXES, KINDS = (".npy", ".png"), ("metric", "relative", "inverse")
 MILLIMETRES = 1e-3
 _LEVELS = 2  # of ARKit's confidence: 0 low, 1 medium, 2 high
 _LOOKED_AT = 4  # files that tell the unit
+_NEAR, _LEAST, _AGREE, _LINES = 0.05, 10, 0.4, 400  # of a fit: share, points, share of them, lines tried
 _BEYOND = 2.0  # share of near and far within which the median of depths of the right unit lies
 
 
@@ -34,17 +35,29 @@ class SensedDepth:
         camera: of the image.
         scale: world units for one unit of the file.
         confidence: .npy or grey PNG as large: from 0 to 1, or ARKit's levels 0, 1, 2; None: 1 everywhere.
+        kind: ``metric``; or, but for a scale and a shift, ``relative`` as depth or ``inverse`` as 1 / depth:
+            what is 0 or below is no hole then, and what lies at ``known`` points tells scale and shift.
+        known: (N, 3), world units. An image that shows too few of them, or contradicts them, is all holes.
     """
 
-    def __init__(self, path: Path, camera: Camera, scale: float, confidence: Path | None = None) -> None:
+    def __init__(
+        self,
+        path: Path,
+        camera: Camera,
+        scale: float = 1.0,
+        confidence: Path | None = None,
+        kind: str = "metric",
+        known: Tensor | None = None,
+    ) -> None:
         self.path, self.camera, self.scale, self.confidence = path, camera, scale, confidence
+        self.kind, self.known = kind, known
 
     def __call__(self) -> Tensor:
         """Give both; SceneError where a file holds anything else."""
         return CACHE.get(self, self._decode)
 
     def _decode(self) -> Tensor:
-        depth = read_depth(self.path)
+        depth = read_depth(self.path, signed=self.kind != "metric")
         trust = np.ones_like(depth) if self.confidence is None else _read_confidence(self.confidence)
         if trust.shape != depth.shape:
             expected = f"{by(depth.shape[::-1])} confidences as {self.path.name}"
@@ -53,15 +66,91 @@ class SensedDepth:
         if abs(depth.shape[0] * size[1] - depth.shape[1] * size[0]) > max(*depth.shape, *size):
             expected = f"depths of the proportions of its image, {by(size[::-1])} pixels"
             raise mismatch(self.path, expected, by(depth.shape[::-1]))
+        if self.kind != "metric":
+            depth = self._fitted(depth)
         planes = torch.from_numpy(np.stack([depth * self.scale, trust * (depth > 0)]).astype(np.float32))
         planes = torch.nn.functional.interpolate(planes[None], size, mode="nearest-exact")[0]
         inner = camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy, camera.skew
         planes[0] /= _cosines(*inner, camera.lens)
         return planes
 
+    def _fitted(self, values: np.ndarray) -> np.ndarray:
+        """Return depths (H, W) in world units of values up to a scale and a shift, NaN where there is none; 0
+        everywhere where points do not tell.
+        """
+        pixel, z = self.camera.project(self.known.double())
+        size = pixel.new_tensor([self.camera.width, self.camera.height])
+        inside = (z > 0) & (pixel >= 0).all(-1) & (pixel < size).all(-1)
+        at = (pixel[inside] / size * pixel.new_tensor(values.shape[::-1])).long().numpy()
+        given, true = values[at[:, 1], at[:, 0]], z[inside].numpy()
+        true, there = 1 / true if self.kind == "inverse" else true, np.isfinite(given)
+        found = line_through(given[there], true[there])
+        if found is None:
+            return np.zeros_like(values)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            depth = found[0] * values + found[1]
+            depth = 1 / depth if self.kind == "inverse" else depth
+            return np.where(np.isfinite(depth) & (depth > 0), depth, 0.0)
 
-def read_depth(path: Path) -> np.ndarray:
-    """Read depths (H, W) float64 of a file as ``SensedDepth`` takes them, holes as 0.
+
+def line_through(given: np.ndarray, true: np.ndarray) -> tuple[float, float] | None:
+    """Find a > 0 and b by which ``a given + b`` is most of ``true`` (N,) > 0, whatever the others are.
+
+    Of many lines through two points that with the most others within ``_NEAR`` of it is fitted to these by
+    least squares. Equal points give the same line.
+
+    Returns:
+        None for fewer than ``_LEAST`` points, or where hardly more than some agree with any line.
+
+    >>> line_through(np.arange(1.0, 21.0), np.append(3 * np.arange(1.0, 19.0) + 2, [1.0, 500.0]))
+    (3.0, 2.0)
+    """
+    if len(given) < _LEAST:
+        return None
+    one, other = np.random.default_rng(0).integers(0, len(given), (2, _LINES))
+    apart = given[other] - given[one]
+    a = (true[other] - true[one]) / np.where(apart == 0, np.inf, apart)
+    b = true[one] - a * given[one]
+    near = np.abs(a[:, None] * given + b[:, None] - true) < _NEAR * true
+    near[a <= 0] = False
+    best = near[near.sum(1).argmax()]
+    if best.sum() < max(_LEAST, _AGREE * len(given)):
+        return None
+    columns = np.stack([given[best] / true[best], 1 / true[best]], 1)  # errors count by their share
+    a, b = np.linalg.lstsq(columns, np.ones(len(columns)), rcond=None)[0]
+    return round(float(a), 9), round(float(b), 9)
+
+
+def depths_beside(folder: Path, names: Sequence[str]) -> dict[str, Path]:
+    """Find the files of images' depth in a folder, by the images' names with or without their own folder.
+
+    Raises:
+        SceneError: where there is none at all.
+    """
+    if not folder.is_dir():
+        raise mismatch("data.depth", "a folder of depths", folder, "set data.depth=null to do without")
+    found = {name: _beside(folder, name) for name in names}
+    found = {name: path for name, path in found.items() if path is not None}
+    if not found:
+        expected = f"depths named as images, {Path(names[0]).name}.npy or .png"
+        raise mismatch(folder, expected, "none of them", "set data.depth=null to do without")
+    return found
+
+
+def confidence_of(depth: Path) -> Path | None:
+    """Find a depth's confidence, by its name in the folder ``confidence`` beside its own; None without."""
+    return _beside(depth.parent.parent / "confidence", depth.stem)
+
+
+def _beside(folder: Path, name: str) -> Path | None:
+    stems = name, name.partition("/")[2], name.rpartition("/")[2]
+    paths = (folder / f"{stem}{suffix}" for stem in stems if stem for suffix in SUFFIXES)
+    return next((path for path in paths if path.is_file()), None)
+
+
+def read_depth(path: Path, *, signed: bool = False) -> np.ndarray:
+    """Read depths (H, W) float64 of a file as ``SensedDepth`` takes them, holes as 0; ``signed``: any values,
+    holes as NaN.
 
     Raises:
         SceneError: for another shape, and for a depth below 0.
@@ -73,7 +162,9 @@ def read_depth(path: Path) -> np.ndarray:
     if len(shape) != 2 or 0 in shape or depth.dtype.kind not in "iuf":
         raise mismatch(path, "depths (H, W)", f"shape {shape}" if hasattr(depth, "shape") else "arrays")
     depth = np.array(depth, np.float64)
-    depth[~np.isfinite(depth)] = 0
+    depth[~np.isfinite(depth)] = np.nan if signed else 0
+    if signed:
+        return depth
     if (depth < 0).any():
         raise mismatch(path, "depths >= 0", f"{depth.min():g}", "write 0 where there is none")
     return depth

@@ -38,7 +38,7 @@ from forewarp.data.cameras import (
     frustum_box,
     pose_of,
 )
-from forewarp.data.depth import SensedDepth, unit_of
+from forewarp.data.depth import SensedDepth, depths_beside, unit_of
 from forewarp.data.directions import by_translation, opposite, other_readings, transposed
 from forewarp.data.files import Entry, inside, mismatch, number, read_json, remove, scene_folder, whole
 from forewarp.data.images import (
@@ -147,7 +147,8 @@ def read_scene(
     turned: list[Path] = []
     depths, unit = {}, size
     if depth is not None:
-        depths = _depths(inside(folder, depth, "data.depth") / f"{scale}x", train_ids)
+        place = inside(folder, depth, "data.depth") / f"{scale}x"
+        depths = depths_beside(place, train_ids)
         unit, told = unit_of([*depths.values()], near / size, far / size)
         unit, assumed = unit * size, assumed + told
 
@@ -368,18 +369,6 @@ def _listed(path: Path, ids: list[str]) -> list[str]:
     if unknown := [name for name in names if name not in {*ids}]:
         raise mismatch(f"{path}: frame_names", "items of dataset.json", short(unknown[0]), "list it in ids")
     return names
-
-
-def _depths(folder: Path, items: Sequence[str]) -> dict[str, Path]:
-    """Find the files of training items' depth in a folder; SceneError where there is none at all."""
-    if not folder.is_dir():
-        raise mismatch(folder, "a folder of depths", "none", "set data.depth=null to do without")
-    paths = {item: inside(folder, f"{item}.npy", "ids") for item in items}
-    there = {item: path for item, path in paths.items() if path.is_file()}
-    if not there:
-        expected, advice = f"depths named as images, {items[0]}.npy", "set data.depth=null to do without"
-        raise mismatch(folder, expected, "none of them", advice)
-    return there
 
 
 def _read_keypoints(path: Path) -> Tensor:

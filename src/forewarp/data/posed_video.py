@@ -8,9 +8,9 @@ holds points that never move.
 
 Beyond nerfstudio's keys a frame may have ``camera``, a name or a number of which of several cameras took it;
 ``moment``, the number from 0 of the instant that it belongs to, where cameras film at times of their own;
-and ``moving_path``, a grey PNG as large as the unscaled image, bright
-where something moves, which is scored apart. ``moving_from`` says where these come from, ``seconds`` how long
-the film is.
+``moving_path``, a grey PNG as large as the unscaled image, bright where something moves, which is scored
+apart; ``depth_file_path`` is nerfstudio's. ``moving_from`` says where masks of motion come from, ``seconds``
+how long the film is.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from torch import Tensor
 
 from forewarp.data.arrays import read_cloud, write_array
 from forewarp.data.cameras import MOST_UNITS, SPLITS, box_of, opengl_rows, space_of
+from forewarp.data.depth import KINDS, MILLIMETRES, SensedDepth, confidence_of, depths_beside
 from forewarp.data.directions import check_directions
 from forewarp.data.files import (
     frames_of,
@@ -113,6 +114,9 @@ def read_scene(
     inverse: bool = False,
     masks: str | None = None,
     alpha: str | None = None,
+    depth: str | None = None,
+    depth_kind: str = "metric",
+    depth_scale: float | None = None,
 ) -> Scene:
     """Read ``root/scene``; pixels are decoded when a frame is first loaded, masks at once.
 
@@ -141,6 +145,12 @@ def read_scene(
             those of ``mask_path`` ignore, as nerfstudio's do; alpha is alpha, unless there is an image
             beneath it, which is refused.
         alpha: colours are ``straight`` or ``premultiplied``; None: as the edges of some images show.
+        depth: folder, of any place or in the scene's, of training images' depth along the optical axis, .npy
+            or PNG of 16 bits, named as they are; a folder ``confidence`` beside it is read likewise. None:
+            ``depth_file_path`` of the frames, where they have it; ``off``: none is used.
+        depth_kind: ``metric``, in the file's units; ``relative``, but for a scale and a shift of each image;
+            ``inverse``, 1 / depth likewise. Points that never move tell both.
+        depth_scale: units of the file for one unit of a metric depth; None: a thousandth of a PNG, 1 of .npy.
 
     Raises:
         SceneError: for every file or value that is missing or wrong, with file and key.
@@ -194,12 +204,33 @@ def read_scene(
     options = {"near": near, "far": far, "box": bounds, "normalise": normalise, "cut_out": has_alpha}
     space, seen = space_of([entry.camera for entry in entries], str(file), **options)
 
+    cloud = _points_of(file, content)
+    still = None if cloud is None else space.points(read_cloud(cloud, 3)).float()
+    depths = {entry.name: entry.depth for entry in entries if entry.depth is not None and depth is None}
+    if depth_kind not in KINDS:
+        raise mismatch("data.depth_kind", f"one of {', '.join(KINDS)}", repr(depth_kind))
+    if depth not in (None, "off"):
+        depths = depths_beside(file.parent / depth, [entry.name for entry in parts["train"]])
+    if depths and depth_kind != "metric" and still is None:
+        advice = "write points.npy, or set data.depth_kind=metric"
+        raise mismatch("data.depth_kind", "points that never move, to fit depth to", "none", advice)
+
+    def sensed(name: str, camera: Camera) -> SensedDepth | None:
+        if (path := depths.get(name)) is None:
+            return None
+        unit = 1.0
+        if depth_kind == "metric":
+            unit = (MILLIMETRES if path.suffix == ".png" else 1.0) if depth_scale is None else depth_scale
+            unit = number(unit, "data.depth_scale", 1 / MOST_UNITS, MOST_UNITS) * space.scale
+        return SensedDepth(path, camera, unit, confidence_of(path), depth_kind, still)
+
     def frame(e: ImageEntry) -> Frame:
-        number = None if e.taken_by is None else views.index(e.taken_by)
-        optional = {"load_valid": e.valid, "load_moving": e.moving, "camera_id": number}
-        return Frame(e.name, e.time, space.camera(e.camera), e.load, **optional)
+        camera_id, camera = None if e.taken_by is None else views.index(e.taken_by), space.camera(e.camera)
+        optional = {"load_valid": e.valid, "load_moving": e.moving, "camera_id": camera_id}
+        return Frame(e.name, e.time, camera, e.load, **optional)
 
     train, val, test = (tuple(map(frame, parts[split])) for split in SPLITS)
+    train = tuple(replace(f, load_sensed=sensed(f.name, f.camera)) for f in train)
     ranks = {time: n for n, time in enumerate(sorted({*times}))}
     moments = {e.name: ranks[e.time] if e.moment is None else e.moment for e in entries}
     held = held_cameras(test_cameras, views, []), held_moments(test_moments, max(moments.values()) + 1)
@@ -231,10 +262,11 @@ def read_scene(
         protocol["moving"] = moving_from
     if "seconds" in content:
         protocol["seconds"] = number(content["seconds"], f"{file}: seconds", 0, 1e9)
-    cloud = _points_of(file, content)
+    if depths:
+        count = sum(f.load_sensed is not None for f in train)
+        protocol["depth"] = f"{depth_kind}, of {count} of {len(train)} training frames"
     if cloud is None and "ply_file_path" in content:
         assumed.append(f"{file}: ply_file_path names no file: there are no points to begin from")
-    still = None if cloud is None else space.points(read_cloud(cloud, 3)).float()
     if still is not None and cloud.suffix == ".ply":
         assumed.append(
             f"{cloud}: its {len(still)} points are taken for points that never move; remove it if the "
@@ -268,6 +300,7 @@ class ImageEntry:
     moving: MovingMask | None = None
     taken_by: str | None = None
     moment: int | None = None
+    depth: Path | None = None
 
 
 def _read_entries(
@@ -324,9 +357,9 @@ def _read_entries(
         taken_by = str(taken_by) if type(taken_by) in (str, int) else None  # an object is another program's
         moment = entry.own.get("moment")
         moment = None if moment is None else whole(moment, entry.where("moment"), 0)
-        entries.append(
-            ImageEntry(name, time_in(entry), camera, load, is_cut_out, valid, moving, taken_by, moment)
-        )
+        depth = entry.path("depth_file_path") if "depth_file_path" in entry.own else None
+        beside = valid, moving, taken_by, moment, depth
+        entries.append(ImageEntry(name, time_in(entry), camera, load, is_cut_out, *beside))
     for key, given in (
         ("mask_path", has_mask),
         ("moving_path", [e.moving is not None for e in entries]),

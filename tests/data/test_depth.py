@@ -1,0 +1,120 @@
+"""Depth that other programs give: of any size, metric or but for a scale and a shift."""
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from forewarp.data.depth import SensedDepth, line_through
+from forewarp.data.files import SceneError
+from forewarp.data.posed_video import FILE, read_scene
+from forewarp.scene.camera import Camera
+from tests.support.written_scenes import edit, write_video
+
+
+def camera_of(width=32, height=24):
+    pose = torch.eye(4, dtype=torch.float64)
+    return Camera(width, height, 30.0, 30.0, width / 2, height / 2, pose, 0.1, 9.0)
+
+
+def wall(camera):
+    """Depth (H, W) of a wall aslant, and points on it."""
+    column = np.arange(camera.width) + 0.5
+    depth = np.tile(2 + column / camera.width, (camera.height, 1))
+    row, column = np.mgrid[1 : camera.height : 4, 1 : camera.width : 4]
+    z = torch.from_numpy(depth[row, column])[..., None]
+    u, v = (torch.from_numpy(n + 0.5)[..., None] for n in (column, row))
+    points = torch.cat([(u - camera.cx) / camera.fx * z, (v - camera.cy) / camera.fy * z, z], -1)
+    return depth, points.reshape(-1, 3).float()
+
+
+def along_axis(planes, camera):
+    return planes[0] * camera.rays().directions[:, 2].reshape(planes[0].shape)
+
+
+@pytest.mark.parametrize(("kind", "shift"), [("relative", -3.0), ("inverse", -0.2)])
+def test_scale_and_shift_follow_from_known_points(tmp_path, kind, shift):
+    camera = camera_of()
+    depth, points = wall(camera)
+    hidden = points[:14] * 1.5  # as many behind the wall, a third of the others
+    values = 4.0 * (depth if kind == "relative" else 1 / depth) + shift
+    values[3, 5] = np.nan
+    np.save(tmp_path / "a.npy", values)
+    given = {"kind": kind, "known": torch.cat([points, hidden, -points])}
+    planes = SensedDepth(tmp_path / "a.npy", camera, **given)()
+    expected = torch.from_numpy(depth).float()
+    expected[3, 5] = 0
+    torch.testing.assert_close(along_axis(planes, camera), expected, rtol=1e-4, atol=0)
+    assert torch.equal(planes[1] > 0, expected > 0)
+    for few in (points[:9], points * torch.linspace(0.2, 5, len(points))[torch.randperm(len(points)), None]):
+        assert not SensedDepth(tmp_path / "a.npy", camera, **given | {"known": few})().any()
+
+
+def test_a_line_needs_points_that_agree():
+    given = np.arange(30.0)
+    assert line_through(given[:9], given[:9] + 1) is None
+    assert line_through(given, 40 - given) is None  # what falls is no depth
+    assert line_through(np.ones(30), given + 1) is None
+
+
+def test_depth_of_a_video_is_in_the_units_of_its_poses(tmp_path):
+    folder = write_video(tmp_path / "toy")
+    (tmp_path / "lidar").mkdir()
+    (tmp_path / "confidence").mkdir()
+    values = np.full((10, 15), 40_000, np.uint16)
+    values[0] = 0
+    for i in (1, 2):
+        Image.fromarray(values).save(tmp_path / "lidar" / f"frame_{i}.png")
+    Image.fromarray(np.full((10, 15), 2, np.uint8)).save(tmp_path / "confidence" / "frame_2.png")
+    np.save(tmp_path / "lidar" / "frame_3.npy", np.full((10, 15, 1), 40.0, np.float32))
+    scene = read_scene(tmp_path, "toy", depth=str(tmp_path / "lidar"))
+    assert scene.protocol["depth"] == "metric, of 3 of 9 training frames"
+    frames = {frame.name: frame for frame in (*scene.train, *scene.test)}
+    units = scene.protocol["normalisation"]["scale"]
+    for i in (1, 2, 3):
+        frame = frames[f"images/frame_{i}"]
+        axis = frame.camera.camera_to_world[:3, 2].float()
+        along = (frame.load_sensed()[0].flatten() * (frame.camera.rays().directions @ axis)).reshape(20, 30)
+        assert along[5, 7].item() == pytest.approx(40 * units, rel=1e-5)
+        assert bool(along[:2].any()) == (i == 3)
+    assert frames["images/frame_4"].load_sensed is None
+    larger = read_scene(tmp_path, "toy", depth=str(tmp_path / "lidar"), depth_scale=2e-3).train[0]
+    torch.testing.assert_close(larger.load_sensed()[0], 2 * frames[larger.name].load_sensed()[0])
+    for place in (folder / FILE,):
+        edit(place, {"frames.0.depth_file_path": "../lidar/frame_1.png"})
+    with pytest.raises(SceneError, match="depth_file_path"):
+        read_scene(tmp_path, "toy")
+    (tmp_path / "lidar").rename(folder / "lidar")
+    edit(folder / FILE, {"frames.0.depth_file_path": "lidar/frame_1.png"})
+    assert read_scene(tmp_path, "toy").protocol["depth"] == "metric, of 1 of 9 training frames"
+    assert "depth" not in read_scene(tmp_path, "toy", depth="off").protocol
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"depth": "nowhere"}, "data.depth: expected a folder of depths, but got .*nowhere; set data.depth="),
+        ({"depth": "images"}, "images: expected depths|expected a grey PNG of 16 bits"),
+        (
+            {"depth_kind": "deep"},
+            "data.depth_kind: expected one of metric, relative, inverse, but got 'deep'",
+        ),
+        (
+            {"depth": "some", "depth_kind": "inverse"},
+            "data.depth_kind: expected points that never move, to fit",
+        ),
+        ({"depth": "some", "depth_scale": 0}, "data.depth_scale: expected"),
+        (
+            {"depth": "other"},
+            "other: expected depths named as images, frame_1.npy or .png, but got none of them",
+        ),
+    ],
+)
+def test_bad_depth_of_a_video_is_refused_in_a_line(tmp_path, options, message):
+    folder = write_video(tmp_path / "toy")
+    for name, file in (("some", "frame_1"), ("other", "a")):
+        (folder / name).mkdir()
+        np.save(folder / name / f"{file}.npy", np.ones((20, 30)))
+    with pytest.raises(SceneError, match=message) as caught:
+        [frame.load_sensed() for frame in read_scene(tmp_path, "toy", **options).train if frame.load_sensed]
+    assert "\n" not in str(caught.value)
