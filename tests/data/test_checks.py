@@ -14,7 +14,7 @@ from forewarp.data.files import SceneError
 from forewarp.data.images import is_premultiplied, straight, write_image
 from forewarp.scene.box import Box
 from forewarp.scene.camera import Camera, look_at
-from forewarp.scene.frame import Frame, sightings
+from forewarp.scene.frame import Frame, sightings, walk_of
 from tests.support.tiny_scene import ball_scene
 from tests.support.written_scenes import (
     MIDDLE,
@@ -72,6 +72,42 @@ def test_what_fits_together_is_not_doubted(tmp_path):
     scene = posed_video.read_scene(tmp_path, "toy")
     assert (scene.protocol["derived"], len(scene.still)) == (["box"], 200)
     assert list(remarks(scene)) == []
+
+
+def walked(degrees, count=9, seconds=None):
+    """A film of a camera that goes so far around the origin, at equal steps."""
+    frames = []
+    for i in range(count):
+        angle = np.deg2rad(degrees) * i / (count - 1)
+        pose = look_at([4 * np.cos(angle), 4 * np.sin(angle), 0.5], [0.0, 0, 0], [0.0, 0, 1])
+        camera = replace(SCENE.train[0].camera, camera_to_world=pose)
+        frames.append(replace(SCENE.train[0], name=f"a{i}", time=i / (count - 1), camera=camera))
+    protocol = {} if seconds is None else {"seconds": seconds}
+    return replace(SCENE, train=tuple(frames), protocol=protocol)
+
+
+def test_a_film_says_how_fast_its_camera_goes_around_its_subject():
+    flat = 0.99228  # the walk is above the ground, so that angles are a little smaller
+    degrees, speed = walk_of(walked(40, seconds=2.0))
+    assert (degrees, speed) == pytest.approx((40 * flat, 20 * flat), rel=1e-3)
+    assert walk_of(walked(40))[1] is None
+    film = walked(40)
+    assert walk_of(replace(film, train=(*film.train, replace(film.train[0], name="b")))) is None  # a rig
+    assert walk_of(replace(film, train=film.train[:2])) is None
+    line = "the camera goes 3 degrees around what it looks at, 1.5 a second: hardly more than one that stands"
+    for film, said in (
+        (walked(3, seconds=2.0), line),
+        (walked(3), line.replace(", 1.5 a second", "")),
+        (
+            walked(20, seconds=40.0),
+            "the camera goes 20 degrees around what it looks at, 0.5 a second: hardly",
+        ),
+    ):
+        assert [text.startswith(said) for text in remarks(film) if text.startswith("the camera goes")] == [
+            True
+        ]
+    for film in (walked(6), walked(20, seconds=2.0), SCENE):
+        assert not any("the camera goes" in text for text in remarks(film))
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,7 @@ from forewarp.data.files import mismatch
 from forewarp.data.images import in_order
 from forewarp.scene.box import Box, Lattice
 from forewarp.scene.camera import Camera, focus_point
-from forewarp.scene.frame import Frame, Scene, sightings, spread
+from forewarp.scene.frame import Frame, Scene, sightings, spread, walk_of
 
 _LOOKED_AT = 8  # training images whose alpha is looked at
 _PIXELS = 4000  # of each
@@ -26,6 +26,7 @@ _WIDEST, _ZOOMED = 130, 1.25  # degrees of a pinhole camera; focal lengths of te
 _ASIDE = 0.25  # share of a side by which a principal point is far from the middle
 _STRETCHED, _SAME_PLACE = 1.25, 1e-9  # sides of a pixel; share of the cameras' distance from the origin
 _AROUND = 2  # half a side of a subject's box in distances of the farthest camera from what they look at
+_WALKED, _SLOW = 5, 1  # degrees around what a film shows, in all and a second, that are too few
 _CUT_OFF, _FEW = 0.1, 0.5  # share of the subject beyond the box; of pixels and points that is too few
 # What mends near or far, the box, and all three, by format; "" is any other.
 _REMEDIES = {
@@ -46,8 +47,8 @@ def remarks(scene: Scene) -> Iterator[str]:
 
     That is a range or box without the point that all cameras look at, or without a part of the subject, or
     one far wider than all cameras; inverted, empty or opaque alpha and masks; masks that leave little; points
-    that no camera sees; cameras in one place, no pinholes, or of test images in other units; test images of
-    times beyond those of training, or in another order than the names' numbers.
+    that no camera sees; cameras in one place, or of a film that hardly move, no pinholes, or of test images
+    in other units; test images of times beyond those of training, or in another order than names' numbers.
 
     Raises:
         SceneError: if no training image shows anything.
@@ -71,6 +72,16 @@ def remarks(scene: Scene) -> Iterator[str]:
             f"all test times, {min(beyond):.4g} to {max(beyond):.4g}, lie outside training's, "
             f"{scene.times[0]:.4g} to {scene.times[-1]:.4g}, of which alone motion is learnt; give images of "
             "one moment one time"
+        )
+    if (
+        not aside
+        and (walk := walk_of(scene)) is not None
+        and (walk[0] < _WALKED or (walk[1] or _SLOW) < _SLOW)
+    ):
+        speed = "" if walk[1] is None else f", {walk[1]:.2g} a second"
+        yield (
+            f"the camera goes {walk[0]:.2g} degrees around what it looks at{speed}: hardly more than one "
+            "that stands still, which tells little of depth; other views of what moves will be guesses"
         )
     if scene.has_alpha:
         yield from _silhouettes(scene, bounded=not aside)
@@ -146,8 +157,8 @@ def _of_test_images(scene: Scene) -> Iterator[str]:
             f"the focal length of test images is {middle:.2g} of their longer side and that of training "
             f"images {min(focal):.2g} to {max(focal):.2g}; compare both"
         )
-    deep = next((frame for frame in scene.test if frame.load_depth is not None), None)
-    depth = None if deep is None else deep.load_depth()
+    deep = next((f for f in (*scene.test, *scene.train) if f.load_depth or f.load_sensed), None)
+    depth = None if deep is None else deep.load_depth() if deep.load_depth else deep.load_sensed()[0]
     if depth is not None and bool((depth > 0).any()):
         away, near, far = float(depth[depth > 0].median()), deep.camera.near, deep.camera.far
         if not near < away < far:

@@ -26,7 +26,7 @@ from forewarp.metrics.geometry import end_point_error
 from forewarp.metrics.registry import METRICS, ImageSuite, scores_of_parts, summarise
 from forewarp.ops.grid import block_means, reduced_depth
 from forewarp.progress import time_text
-from forewarp.scene.frame import Scene, spread
+from forewarp.scene.frame import Scene, spread, walk_of
 from forewarp.scene.view import Moment, Rendering, Target, View
 from forewarp.training.module import DynamicSceneModule
 
@@ -196,11 +196,12 @@ def middles(count: int, wanted: int | None) -> list[int]:
 
 def from_training(scene: Scene) -> dict[str, str]:
     """Say how far in time test frames are from the nearest training frame: steps between the frames, and
-    seconds where the scene's protocol has the length of its film; {} without steps.
+    seconds where the scene's protocol has the length of its film; and how fast the film's camera goes around
+    what it looks at. {} without steps.
 
     >>> from types import SimpleNamespace as Of
-    >>> train, test = ([Of(time=t) for t in times] for times in ((0.0, 0.2, 0.3, 0.6), (0.1, 0.4, 0.45)))
-    >>> from_training(Of(train=train, test=test, protocol={"seconds": 5.0}))
+    >>> train, test = ([Of(time=t) for t in times] for times in ((0.0, 0.2, 0.3, 0.3), (0.1, 0.4, 0.45)))
+    >>> from_training(Of(train=train, test=test, protocol={"seconds": 5.0}, times=(0.0, 0.2, 0.3)))
     {'nearest_training_frame': '1 to 1.5 steps of 0.5 s'}
     """
     train, test = ([frame.time for frame in frames] for frames in (scene.train, scene.test))
@@ -211,8 +212,11 @@ def from_training(scene: Scene) -> dict[str, str]:
     gaps = sorted(min(abs(time - at) for at in train) / step for time in test)
     least, most = (f"{gap:.2g}" for gap in (gaps[0], gaps[-1]))
     steps = (least if least == most else f"{least} to {most}") + (" step" if most == "1" else " steps")
-    seconds = scene.protocol.get("seconds")
-    return {"nearest_training_frame": f"{steps} of {seconds * step:.3g} s" if seconds else steps}
+    seconds, walk = scene.protocol.get("seconds"), walk_of(scene)
+    told = {"nearest_training_frame": f"{steps} of {seconds * step:.3g} s" if seconds else steps}
+    if walk is not None and walk[1] is not None:
+        told["camera_motion"] = f"{walk[1]:.3g} degrees a second (omega), {walk[0]:.3g} in all"
+    return told
 
 
 def mean_scores(module: DynamicSceneModule, targets: Sequence[Target], suite: ImageSuite) -> dict[str, float]:

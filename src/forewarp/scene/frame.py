@@ -12,7 +12,7 @@ from torch import Tensor
 from forewarp.ops.grid import dilate
 from forewarp.scene.box import Box, Lattice
 from forewarp.scene.brief import brief
-from forewarp.scene.camera import Camera
+from forewarp.scene.camera import Camera, focus_point
 
 
 @dataclass(frozen=True)
@@ -151,6 +151,28 @@ def _pixels(camera: Camera, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     pixel, z = camera.project(points)
     column, row = pixel.floor().long().unbind(-1)
     return row, column, (z > 0) & (column >= 0) & (row >= 0) & (column < camera.width) & (row < camera.height)
+
+
+def walk_of(scene: Scene) -> tuple[float, float | None] | None:
+    """Measure how far the camera of a film goes around what it looks at, the point nearest to all its axes.
+
+    Returns:
+        degrees, summed over all training images, and degrees a second where the scene's protocol has the
+        film's ``seconds``: dycheck's angular effective multi-view factor, about 10 to 30 of one who walks
+        around a subject. None where several cameras film together, or of fewer than three images.
+
+    Source: Gao et al., "Monocular Dynamic View Synthesis: A Reality Check" (2022).
+    """
+    frames = sorted(scene.train, key=lambda frame: frame.time)
+    if len(frames) < 3 or len(scene.times) < len(frames):
+        return None
+    towards = focus_point([frame.camera for frame in frames]) - torch.stack([f.camera.center for f in frames])
+    towards = torch.nn.functional.normalize(towards.double(), dim=-1)
+    steps = torch.linalg.cross(towards[:-1], towards[1:]).norm(dim=-1)  # exact where angles are small
+    degrees = float(torch.rad2deg(torch.atan2(steps, (towards[:-1] * towards[1:]).sum(-1))).sum())
+    seconds = scene.protocol.get("seconds")
+    duration = (seconds or 0.0) * (frames[-1].time - frames[0].time)
+    return degrees, degrees / duration if duration > 0 else None
 
 
 @dataclass(frozen=True)
