@@ -2,6 +2,7 @@
 
 import json
 import subprocess
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import imageio_ffmpeg
@@ -11,6 +12,7 @@ import torch
 
 from forewarp.data import hypernerf, multicam, posed_video
 from forewarp.data.video import stamps_of
+from forewarp.synth import raycast
 from forewarp.synth.movers import SHADOW_RAYS, hall, moving_faces, placed_movers
 from forewarp.synth.raycast import Posed, camera_rays, render
 from forewarp.synth.recordings import (
@@ -123,6 +125,23 @@ def test_a_synchronised_rig_is_in_the_layout_of_dynerf(tmp_path):
         assert frame.camera.fx == pytest.approx(true.camera.fx)
         gray, true_gray = (image.load()[..., :3].numpy() @ LUMA for image in (frame, true))
         assert np.abs(gray - true_gray).mean() < 3
+
+
+@pytest.mark.parametrize(
+    ("write", "arguments"),
+    [(synthesize_multicam, {"cameras": 2, "size": 16}), (synthesize_iphone, {"size": 12})],
+)
+def test_images_do_not_depend_on_the_number_of_processes(tmp_path, monkeypatch, write, arguments):
+    """Threads take the processes' place, which start slowly."""
+    monkeypatch.setattr(raycast, "ProcessPoolExecutor", lambda workers, *_: ThreadPoolExecutor(workers))
+    for workers in (1, 2):
+        write(tmp_path / str(workers), **arguments, frames=2, samples_per_pixel=1, workers=workers)
+    alone, together = (
+        {path.relative_to(tmp_path / name): path.read_bytes() for path in (tmp_path / name).rglob("*.*g")}
+        for name in ("1", "2")
+    )
+    assert len(alone) >= 8
+    assert alone == together
 
 
 def test_cameras_surround_the_movers_and_neighbours_see_alike():
