@@ -27,8 +27,10 @@ from forewarp.synth.raycast import (
 from forewarp.synth.shapes import Material, Part, box, sphere
 from forewarp.synth.vehicle import rotation, shift
 from forewarp.synth.world import (
+    BACK,
     INK,
     LACQUER,
+    LEFT,
     LIGHT_AT,
     ROOM_HIGH,
     ROOM_LOW,
@@ -42,7 +44,19 @@ from forewarp.synth.world import (
 MOVERS = ("box", "ball")
 RADIUS, BOUNCE, GRAVITY = 0.15, 0.36, 9.81  # of the ball, how high it bounces
 HALL_LOW, HALL_HIGH = (-3.2, -3.7, ROOM_LOW[2]), (3.2, ROOM_HIGH[1], ROOM_HIGH[2])
-FINENESS = 1.8  # tiles of the hall: 20 to 30 pixels wide, so that there are corners to match everywhere
+FINENESS = 1.8  # of the hall's tiles, which are 20 to 30 pixels wide in the rig's images
+# Pictures and mats, whose tiles are 7 to 10 pixels wide: without them the same features are found less
+# accurately. A side, then metres: along it and up (a mat: x and y), width and height.
+PICTURES = (
+    *(("back", -2.6, 0.9, 0.6, 0.8), ("back", -1.7, 1.5, 0.7, 0.5), ("back", -0.5, 1.6, 0.5, 0.7)),
+    *(("back", 0.3, 0.6, 0.5, 0.4), ("back", 1.4, 0.5, 0.6, 0.9), ("back", 2.2, 1.3, 0.7, 0.6)),
+    *(("left", -2.4, 0.9, 0.7, 0.6), ("left", -1.2, 0.4, 0.6, 0.8), ("left", -0.1, 1.3, 0.7, 0.5)),
+    *(("right", -2.4, 0.9, 0.7, 0.6), ("right", -1.2, 0.4, 0.6, 0.8), ("right", -0.1, 1.3, 0.7, 0.5)),
+    *(("left", 0.8, 0.6, 0.6, 0.7), ("right", 0.8, 0.6, 0.6, 0.7), ("mat", -1.9, -1.0, 0.7, 0.5)),
+    *(("mat", -0.9, -1.5, 0.6, 0.5), ("mat", 0.4, -1.3, 0.7, 0.5), ("mat", 1.3, -0.8, 0.6, 0.7)),
+    *(("mat", 1.5, 0.4, 0.7, 0.6), ("mat", -2.4, 0.3, 0.6, 0.6)),
+)
+PALETTES, SMALL_TILE = (STONES, TILES, LACQUER, BACK, LEFT), 0.04
 SHADOW_RAYS = 2  # a sample; eight lights a pixel
 _PAD = 4  # pixels around what moves
 _TOUCHED = 0.06  # of an image, about
@@ -124,8 +138,24 @@ def placed_movers(world: World, time: float) -> dict[str, np.ndarray]:
 @lru_cache(4)
 def hall(seconds: float, has_movers: bool = True) -> World:
     """Make the room with or without its movers; times from 0 to 1 last ``seconds``."""
-    subject = specimen(seconds, lambda: room(HALL_LOW, HALL_HIGH, FINENESS))
+    subject = specimen(seconds, lambda: room(HALL_LOW, HALL_HIGH, FINENESS) + _pictures())
     return World(subject if has_movers else replace(subject, absent=lambda time: MOVERS))
+
+
+def _pictures() -> list[Part]:
+    """Hang pictures on three walls and lay mats on the floor, in small tiles."""
+    ways = {  # a place along and up the wall, or on the floor, to the corners (3,) of a thin box
+        "back": lambda x, z, w, h: ((x, HALL_HIGH[1] - 0.01, z), (x + w, HALL_HIGH[1], z + h)),
+        "left": lambda y, z, w, h: ((HALL_LOW[0], y, z), (HALL_LOW[0] + 0.01, y + w, z + h)),
+        "right": lambda y, z, w, h: ((HALL_HIGH[0] - 0.01, y, z), (HALL_HIGH[0], y + w, z + h)),
+        "mat": lambda x, y, w, h: ((x, y, HALL_LOW[2]), (x + w, y + h, HALL_LOW[2] + 0.006)),
+    }
+    made = []
+    for number, (side, *place) in enumerate(PICTURES):
+        colors, scale = PALETTES[number % len(PALETTES)], SMALL_TILE + 0.003 * (number % 7)
+        mosaic = Material("mosaic", colors, scale)
+        made.append(Part(f"{side}{number}", "ground", *box(*ways[side](*place)), mosaic))
+    return made
 
 
 class Film:
