@@ -63,7 +63,8 @@ BESIDE = ((-118.0, 20.0), (-66.0, 9.0))
 # depth in an image and their greatest radius in widths.
 DEPTH_ERROR, BLOCK, REACH, EDGE, PATCHES, PATCH = 0.01, 2, 5.0, 0.05, 3, 0.08
 LEAST_VIEWS, LEAST_SHARE = 5, 0.1  # of the training images: a co-visible pixel is seen in more
-TRACKS, KEYPOINTS, MARKED = 4000, 8, 10  # points followed; points marked, in how many training images
+# Points followed; points marked, of how many drawn, in how many training images.
+TRACKS, KEYPOINTS, CANDIDATES, MARKED = 4000, 8, 400, 10
 # Streams of random numbers.
 _LENSES, _OFFSETS, _SOUNDS, _DRAWN, _TRACKS, _KEYS, _LIDAR = range(20, 27)
 
@@ -256,25 +257,19 @@ def synthesize_iphone(
     phones = [_phone_beside(*place, shape) for place in BESIDE]
     moments = [*range(0, frames, beside)]
     total, middle = frames + len(phones) * len(moments), middle_of(times)
-    drawn = {
-        kind: surface_points(
-            world, count, cameras[:: max(1, frames // 8)], _stream(seed, place), middle, among
-        )
-        for kind, (count, place, among) in {
-            "tracks": (TRACKS, _TRACKS, world.casts),
-            "keypoints": (KEYPOINTS, _KEYS, moving_faces(world)),
-        }.items()
-    }
+    some = cameras[:: max(1, frames // 8)]
+    tracks = surface_points(world, TRACKS, some, _stream(seed, _TRACKS), middle, world.casts)
+    chosen = np.linspace(0, frames, min(frames, MARKED), endpoint=False).astype(int).tolist()
+    marks = _marks(world, [times[t] for t in chosen], [cameras[t] for t in chosen], _stream(seed, _KEYS))
 
     def shots() -> Iterator[RigShot]:
         rays = size * shape[1] * frames * samples_per_pixel
         processes = workers or max(1, min(cores(), int(rays / SAMPLES_A_PROCESS)))
         jobs = ((seconds, time, camera, samples_per_pixel) for time, camera in zip(times, cameras))
-        chosen = {*np.linspace(0, frames, min(frames, MARKED), endpoint=False).astype(int).tolist()}
         for t, (rgb, distance) in enumerate(by_processes(_whole, jobs, processes)):
             depth, keypoints = lidar(cameras[t], distance, _stream(seed, _LIDAR, t)), None
             if t in chosen:
-                keypoints = _keypoints(world, times[t], cameras[t], *drawn["keypoints"])
+                keypoints = _keypoints(world, times[t], cameras[t], *marks)
             yield RigShot(f"0_{t:05d}", t, 0, "train", cameras[t], rgb, depth=depth, keypoints=keypoints)
             if progress is not None:
                 progress(t + 1, total)
@@ -296,9 +291,9 @@ def synthesize_iphone(
 
     low, high, near, far = _space_of(world, times, cameras)
     center, scale = 0.5 * (low + high), 1 / float(np.linalg.norm(high - low))
-    points = still_points(world, cameras[:: max(1, frames // 8)], _stream(seed, _DRAWN), POINTS)
+    points = still_points(world, some, _stream(seed, _DRAWN), POINTS)
     order = [middle, *(time for time in times if time != middle)]
-    truth = world.trajectories(*drawn["tracks"], np.array(order))
+    truth = world.trajectories(*tracks, np.array(order))
     limits = {"center": center.tolist(), "scale": scale, "near": scale * near, "far": scale * far}
     with closing(shots()) as made:
         hypernerf.write_scene(folder, made, **limits, points=points, trajectories=truth)
@@ -340,6 +335,18 @@ def _seen_by(world: World, time: float, camera: Camera, pixels: np.ndarray | Non
     """Find the surface points that pixels show: faces (N,) and barycentric coordinates (N, 3)."""
     hits = Posed(world, time).first_hits(*camera_rays(camera, pixels=pixels))
     return hits.face, hits.barycentric
+
+
+def _marks(world: World, times, cameras, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Choose the keypoints among points drawn on the movers: as many of each, those that most images show."""
+    face, barycentric = surface_points(world, CANDIDATES, cameras, rng, times[0], moving_faces(world))
+    counts, part = views_of(world, times, cameras, face, barycentric), world.part_of_face[face]
+    ranked = [
+        rows[np.argsort(-counts[rows], kind="stable")]
+        for rows in (np.flatnonzero(part == one) for one in np.unique(part))
+    ]
+    best = np.concatenate([rows[: KEYPOINTS // len(ranked)] for rows in ranked])
+    return face[best], barycentric[best]
 
 
 def _keypoints(world: World, time: float, camera: Camera, face, barycentric) -> np.ndarray:
