@@ -18,6 +18,7 @@ import torch
 from filelock import FileLock, Timeout
 from torch import Tensor
 
+from forewarp.clock import left_out
 from forewarp.data.files import mismatch, number
 from forewarp.data.images import CACHE, by
 from forewarp.data.video import extracted
@@ -92,18 +93,22 @@ class Film:
 
 
 class FilmImage:
-    """Frame ``number`` of a film, uint8 (H, W, 4), alpha 255; kept while there is room, and read-only."""
+    """Frame ``number`` of a film, uint8 (H, W, 4), alpha 255; read-only.
+
+    One from ``STORE`` is not kept in memory: the system keeps what was read, and gives it up for others.
+    """
 
     def __init__(self, film: Film, number: int) -> None:
         self.film, self.number = film, number
 
     def __call__(self) -> Tensor:
         """Give the pixels; SceneError as ``Film.decoded`` and ``FilmStore.fill``."""
-        return CACHE.get(self, self._decode)
+        if not self.film.is_stored:
+            return CACHE.get(self, self._decode)
+        with left_out():  # reading images is no training
+            return _opaque(STORE.frame(self.film, self.number))
 
     def _decode(self) -> Tensor:
-        if self.film.is_stored:
-            return _opaque(STORE.frame(self.film, self.number))
         if self.film.bytes_of_all > CACHE.limit:
             (pixels,) = self.film.decoded(self.number, 1)
             return _opaque(pixels)
