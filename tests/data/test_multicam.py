@@ -8,12 +8,15 @@ import pytest
 import torch
 
 from forewarp.data.batches import Sampler
+from forewarp.data.checks import blind_frames
 from forewarp.data.files import SceneError
 from forewarp.data.films import STORE
 from forewarp.data.images import CACHE, write_image
 from forewarp.data.module import MulticamDataModule
 from forewarp.data.multicam import FILE, read_scene, write_poses
 from forewarp.data.rigs import held_cameras
+from forewarp.scene.box import Box
+from forewarp.scene.camera import Camera
 from forewarp.synth.films import write_scene
 from tests.support.films import numbered, write_film
 from tests.support.written_scenes import fixed_cameras, grey, placed, write_multicam
@@ -138,6 +141,17 @@ def test_cameras_of_other_lengths_are_cut_to_the_shortest(folder):
     line = f"{folder}: cam01 has 5 frames, others up to 6: all are cut to the first 5"
     assert scene.protocol["assumed"] == [line]
     assert "assumed" not in read_scene(folder.parent, "toy", frames=5).protocol
+
+
+def test_a_camera_is_looked_through_once_for_all_its_frames(frames, monkeypatch):
+    scene, project, calls = read_scene(frames, "toy"), Camera.project, []
+    monkeypatch.setattr(
+        Camera, "project", lambda camera, points: calls.append(camera) or project(camera, points)
+    )
+    assert blind_frames(scene) == 0
+    assert len(calls) == 2 < len(scene.train)
+    away = replace(scene, box=Box((90, 90, 90), (91, 91, 91)))
+    assert blind_frames(away) == len(scene.train)
 
 
 def rows(change):

@@ -32,7 +32,6 @@ from forewarp.data.images import (
     TURN,
     StoredImage,
     by,
-    common_header,
     in_order,
     inspect_image,
     reduced,
@@ -71,13 +70,15 @@ class _Row:
 class _Track:
     """What a camera took: a video at ``path``, or ``images`` in a folder, ``size`` (width, height) on disk.
 
-    ``stamps`` are the seconds of a video's frames, None of a folder.
+    ``stamps`` are the seconds of a video's frames, None of a folder; ``turned`` the images that their EXIF
+    orientation turns.
     """
 
     path: Path
     size: tuple[int, int]
     stamps: np.ndarray | None = None
     images: tuple[Path, ...] = ()
+    turned: frozenset[Path] = frozenset()
 
     def __len__(self) -> int:
         return len(self.images) if self.stamps is None else len(self.stamps)
@@ -138,7 +139,7 @@ def read_scene(
     rows = _read_rows(folder / FILE, list(paths))
     tracks = [_look(path) for path in paths.values()]
     count, assumed = _moments(tracks, None if frames is None else whole(frames, "data.frames", 1), folder)
-    turned = [path for track in tracks for path in track.images[:count] if inspect_image(path).is_turned]
+    turned = [path for track in tracks for path in track.images[:count] if path in track.turned]
     assumed += turned_by_exif(turned, folder)
     held, moments = held_cameras(test_cameras, list(paths), [0]), held_moments(test_moments, count)
     factors = [_factor(track, row, scale) for track, row in zip(tracks, rows)]
@@ -276,9 +277,13 @@ def _read_rows(path: Path, names: Sequence[str]) -> list[_Row]:
 def _look(path: Path) -> _Track:
     """Find the size and number of a camera's frames."""
     if path.is_dir():
-        images = tuple(_images(path))
+        images, turned, size = tuple(_images(path)), set(), None
+        for image in images:
+            header = inspect_image(image, size, " as the first")
+            size = header.size
+            turned |= {image} if header.is_turned else set()
         place = path.parent if path.name == "images" else path
-        return _Track(place, common_header(images).size, None, images)
+        return _Track(place, size, None, images, frozenset(turned))
     stamps = stamps_of(path)
     first = next(extracted(path, [0], None), None) if len(stamps) else None
     if first is None:

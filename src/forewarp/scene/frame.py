@@ -201,7 +201,9 @@ def survey(scene: Scene) -> Survey:
     middle = torch.tensor(scene.box.center).double()
     towards = torch.stack([frame.camera.center.double() - middle for frame in scene.train])
     towards = torch.nn.functional.normalize(towards, dim=-1)
-    angle = math.degrees(math.acos(float((towards @ towards.T).min().clamp(-1, 1))))
+    # Row by row, as products of all pairs grow with the square of the frames.
+    least = min(float((towards @ row).min()) for row in towards)
+    angle = math.degrees(math.acos(max(-1.0, min(1.0, least))))
     disagreement = _disagreement(scene, frames) if cut_out > 0 and len(frames) > 1 else 0.0
     return Survey(len(scene.train), len(scene.times), cut_out, angle, disagreement)
 
