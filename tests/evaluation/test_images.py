@@ -127,7 +127,7 @@ def test_tails_follow_the_ball_and_nothing_is_drawn_before_it_moves(cameras):
     paint = Trajectories(module, cameras, count=80, tail=1.0)
     shots = [(camera, 0.0), (camera, 1.0)]
     plain = list(video(module, shots, WHITE))
-    drawn = list(video(module, shots, WHITE, paint))
+    drawn = list(video(module, shots, WHITE, [paint]))
     ink = [(a - b).abs().amax(-1) > 0.05 for a, b in zip(plain, drawn)]
     before, after = camera.project(torch.tensor([[-0.3, 0.1, 0.0], [0.5, 0.1, 0.0]]))[0][:, 0].tolist()
     assert abs(before - after) > 10
@@ -146,7 +146,7 @@ def test_what_stands_behind_the_ball_is_not_drawn(cameras):
     behind = (paint.points - torch.tensor([-0.3, 0.1, 0.0])) @ camera.camera_to_world[:3, 2].float() > 0.2
     assert int(behind.sum()) > 5
     paint.points, paint.colors = paint.points[behind], paint.colors[behind]
-    plain, drawn = (next(video(module, [(camera, 0.0)], WHITE, p)) for p in (None, paint))
+    plain, drawn = (next(video(module, [(camera, 0.0)], WHITE, p)) for p in ((), [paint]))
     torch.testing.assert_close(plain, drawn)
 
 

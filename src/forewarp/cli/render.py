@@ -5,6 +5,8 @@ forewarp-render makes a video of a finished run, into its videos/.
   forewarp-render run=runs/hand/particles-fast-seed0 path=swing      a capture, filmed from one side
   forewarp-render run=FOLDER path=trajectories format=gif size=300
 
+Of a film, what no training image shows fades to black, and how much did is said.
+
 What one types most:
   run=FOLDER                    the run (needed)
   path=fixed                    one camera, through time; what you get without path=
@@ -66,6 +68,7 @@ def write_film(config, run, module) -> Path:
 
 def pictures_of(config, module, datamodule, masks: Path):
     """Render the pictures of the video that the config describes; write their masks, if it asks for any."""
+    from forewarp.evaluation.filmed import Fade
     from forewarp.evaluation.images import make_shots, sized, video
     from forewarp.evaluation.layers import layer_of, moving_rows
     from forewarp.evaluation.trajectories import Trajectories
@@ -83,8 +86,17 @@ def pictures_of(config, module, datamodule, masks: Path):
     camera = target.frame.camera
     start = sized(camera, config.size or max(camera.width, camera.height, LEAST_SIZE))
     shots = make_shots(config.path, config.frames, float(config.time), start, cameras)
-    pictures = video(module, shots, target.background.to(module.device), paint)
+    fade = None if datamodule.scene.has_alpha else Fade(cameras)
+    paints = [p for p in (fade, paint) if p is not None]
+    pictures = told_after(video(module, shots, target.background.to(module.device), paints), fade)
     return pictures if moving is None else with_masks(pictures, method, shots, moving, masks)
+
+
+def told_after(pictures, fade):
+    """Yield the pictures; say at their end what faded."""
+    yield from pictures
+    if fade is not None and (line := fade.told()):
+        print(line)
 
 
 def with_masks(pictures, method, shots, moving, folder: Path):

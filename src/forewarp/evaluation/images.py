@@ -146,7 +146,7 @@ def make_shots(path: str, frames: int, time: float, camera: Camera, cameras: Seq
 
 
 def video(
-    module: DynamicSceneModule, shots: Sequence[Shot], background: Tensor, paint: Paint | None = None
+    module: DynamicSceneModule, shots: Sequence[Shot], background: Tensor, paints: Sequence[Paint] = ()
 ) -> Iterator[Tensor]:
     """Render the images (H, W, 3) in [0, 1] of a video one by one, with one snapshot for each time.
 
@@ -154,7 +154,7 @@ def video(
         module: the fitted scene.
         shots: camera and time of each image.
         background: colour (3,).
-        paint: draws over an image; see ``Trajectories``.
+        paints: draw over each image, in their order; see ``Trajectories``, ``Fade``.
     """
     snapshot = None
     for camera, time in shots:
@@ -164,7 +164,8 @@ def video(
                 snapshot = module.method.at(moment)
             drawn = snapshot.render(View(camera), background)
             image = drawn.rgb.reshape(camera.height, camera.width, 3).clamp(0, 1)
-            image = image if paint is None else paint(image, drawn, camera, time)
+            for paint in paints:
+                image = paint(image, drawn, camera, time)
         yield image
 
 

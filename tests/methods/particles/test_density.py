@@ -1,10 +1,12 @@
 """Particles split and go, their opacity is bounded and decays, and what does not move comes to rest."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
 
+from forewarp.data.module import SceneDataModule
 from forewarp.methods.particles import density
 from forewarp.methods.particles.density import _product, _quaternions, come_to_rest, renew, too_near
 from forewarp.methods.rows import take_rows
@@ -188,6 +190,26 @@ def test_what_rests_keeps_resting_through_steps_and_density_control(half):
     assert len(method.resting) == len(method.means)
     assert int(method.skinning.shares[method.resting].count_nonzero()) == 0
     assert bool(method.resting.any())
+
+
+def test_what_is_beyond_the_box_rests_without_a_node_and_may_be_large():
+    scene = replace(DATA.scene, has_alpha=False)
+    data = SceneDataModule(lambda: scene, rays=1)
+    data.setup("fit")
+    module = module_with(data, numbers={"shell": 4.0})
+    method, optimizer = module.method, module.configure_optimizers()
+    beyond = method.beyond(method.means.data)
+    assert 0 < int(beyond.sum()) < len(beyond)
+    assert torch.equal(method.resting, beyond)
+    assert not bool(method.beyond(method.nodes.positions).any())
+    method.scales.data[beyond] = math.log(0.5 * float(method.extent))
+    method.gradient_sum += 1.0
+    method.image_count += 1.0
+    for number in range(1, 4):
+        method.advance(0.1 * number, number, optimizer)
+    assert bool(method.resting[method.beyond(method.means.data)].all())
+    assert int(method.resting.sum()) > int(beyond.sum())  # split, not removed
+    assert int(method.skinning.shares[method.resting].count_nonzero()) == 0
 
 
 @pytest.mark.parametrize(("covered", "least"), [(1e6, 0.02), (100.0, 0.5013)])

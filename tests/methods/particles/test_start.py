@@ -91,6 +91,18 @@ def test_a_sweep_of_images_of_one_row(scene_of):
     assert cloud is None or inside(cloud.points, scene.box)
 
 
+def test_points_lie_beyond_the_box_where_there_is_a_shell(scene_of):
+    scene = scene_of("hypernerf")
+    cloud = swept(scene, [], 400, shell=4.0)
+    low, high = torch.tensor(scene.box.low), torch.tensor(scene.box.high)
+    beyond = ((cloud.points < low) | (cloud.points > high)).any(-1)
+    assert 0 < int(beyond.sum()) < len(cloud)
+    for frame in scene.train:  # no ray goes past all
+        rays = frame.camera.rays()
+        holes = _in_holes(cloud.points, rays.origins + rays.directions, frame.camera, 8)
+        assert not bool(holes.any())
+
+
 def test_an_image_of_a_sweep_fills_only_its_holes(scene_of):
     camera = scene_of("hypernerf").train[0].camera  # 20 x 16 pixels; cells of 4 x 4
     rays = camera.rays()

@@ -59,7 +59,7 @@ def control(particles: Particles, progress: float, optimizer: torch.optim.Optimi
         particles.skinning.relink(particles.nodes, particles.means.data, optimizer)
         if (still := left_alone(particles.shared, particles.resting)) is not None:
             particles.skinning.release(still)
-        if particles.resting is not None and progress >= stage.rest_from:
+        if particles.least_motion is not None and progress >= stage.rest_from:
             least = max(particles.least_motion, pixel_width(float(particles.covered_pixels)))
             come_to_rest(particles, least * float(particles.extent))
 
@@ -80,7 +80,8 @@ def renew(particles: Particles, target: int, optimizer: torch.optim.Optimizer) -
     gone = particles.unseen_rounds.isinf()
     particles.unseen_rounds.copy_(torch.where(particles.image_count > 0, 0.0, particles.unseen_rounds + 1))
     gone |= most_opaque(particles) < _FADED
-    gone |= particles.scales.amax(-1).exp() > _LARGE * float(particles.extent)
+    large = particles.scales.amax(-1).exp() > _LARGE * float(particles.extent)
+    gone |= large & ~particles.beyond(particles.means.data)
     if particles.nodes is not None:
         first, last = particles.nodes.seen_times.tolist()
         if first <= particles.ends[0] + 0.02 and last >= particles.ends[1] - 0.02:

@@ -18,7 +18,7 @@ from forewarp.methods.method import Method, Snapshot, Start, Step
 from forewarp.methods.particles import density, queries
 from forewarp.methods.particles.nodes import Nodes, Skinning, TimeOffsets, are_rows
 from forewarp.methods.particles.options import EFFECTS, Effects, Numbers, ParticlesPlanning, view_share
-from forewarp.methods.particles.shared import begin_window
+from forewarp.methods.particles.shared import begin_window, left_alone
 from forewarp.methods.particles.start import (
     compile_kernels,
     covered_pixels,
@@ -103,6 +103,7 @@ class Particles(Method):
         self.progress = self.decay = 0.0
         self.shown_now: list[Tensor] = []  # which particles each image of this step showed
 
+        self.box = start.scene.box if self.stage.shell and not start.scene.has_alpha else None
         values = self._first_values(start)
         count = len(values["means"])
         self.means = nn.Parameter(values["means"])
@@ -121,14 +122,15 @@ class Particles(Method):
         self.register_buffer("unseen_rounds", torch.zeros(count))  # infinite: to be removed
         self.register_buffer("round", torch.zeros((), dtype=torch.int64))
         self.least_motion = effects.background
-        resting = None if effects.background is None else torch.zeros(count, dtype=torch.bool)
-        self.register_buffer("resting", resting)
+        may_rest = effects.background is not None or (self.box is not None and effects.motion is not None)
+        self.register_buffer("resting", self.beyond(self.means.data) if may_rest else None)
         # Rows of the run that windows of a film begin from: particles that stay as they are; -1: of its own.
         self.register_buffer("shared", values.get("shared"))
 
         self.nodes = self.skinning = None
         if effects.motion is not None:
-            own = self.means.data if self.shared is None else self.means.data[self.shared < 0]
+            still = left_alone(self.shared, self.resting)
+            own = self.means.data if still is None or bool(still.all()) else self.means.data[~still]
             nodes, knots = self.stage.motion(len(own), len(times))
             natural = self.stage.natural_splines
             curve = Curve(effects.motion, knots, len(times), self.canonical_time, straight=natural)
@@ -139,8 +141,8 @@ class Particles(Method):
             rotates, rests = effects.rotation is not None, effects.background is not None
             self.nodes = Nodes(points, nodes, curve, offsets, rotates=rotates, rests=rests, edges=edges)
             self.skinning = Skinning(self.nodes, self.means.data)
-            if self.shared is not None:
-                self.skinning.release(self.shared >= 0)
+            if still is not None:
+                self.skinning.release(still)
         self.grows = tuple(name for name in _ROWS if getattr(self, name) is not None)
         self.grows += () if self.skinning is None else Skinning.ROWS
 
@@ -168,18 +170,27 @@ class Particles(Method):
         else:
             covered = covered_pixels(start.scene, list(start.frames))
             count = round(self.stage.initial_share * self.stage.final_count(covered, self.views))
-            cloud = first_points(start, count)
-            distances = (cloud.points - cloud.points.median(0).values).norm(dim=-1)
+            cloud = first_points(start, count, 0.0 if self.box is None else self.stage.shell)
+            beyond = self.beyond(cloud.points)
+            near = cloud.points if bool(beyond.all()) else cloud.points[~beyond]
+            distances = (near - near.median(0).values).norm(dim=-1)
             extent = float(distances.median()) or start.scene.box.diagonal
             # Points of a hull lie on its surface, and are as far apart as particles should be large.
             widest = None if start.scene.has_alpha else widths(start.scene, cloud.points, covered)
-            values = first_values(cloud, widest)
+            values = first_values(cloud, widest, beyond)
         self.register_buffer("covered_pixels", torch.tensor(covered))
         self.register_buffer("extent", torch.tensor(extent))
         self.register_buffer("moving_pixels", torch.tensor(moving) if start.shares else None)
         final_count = float(self.stage.final_count(moving if start.shares else covered, self.views))
         self.register_buffer("final_count", torch.tensor(final_count))
         return values
+
+    def beyond(self, points: Tensor) -> Tensor:
+        """Return which points (N, 3) lie outside the box in which motion is looked for: bool (N,)."""
+        if self.box is None:
+            return torch.zeros(len(points), dtype=torch.bool, device=points.device)
+        low, high = points.new_tensor(self.box.low), points.new_tensor(self.box.high)
+        return ((points < low) | (points > high)).any(-1)
 
     @property
     def moves(self) -> bool:

@@ -104,6 +104,8 @@ class Numbers:
             the learning rate of opacity is its first; as that falls, so does the share.
         crowd_decay: extra opacity decay per step, scaled by ``max(0, 1 - covered_pixels / final_count)``.
         rigid_final_factor: factor that the weight of ``rigid`` falls to by the end.
+        shell: far planes of the cameras at which particles stand behind all that images show; what is outside
+            the box is at rest. 0: particles begin in the box, and all may move. Images with alpha have none.
         name: name of the stage.
 
     Raises:
@@ -128,6 +130,7 @@ class Numbers:
     opacity_decay: float = 0.0
     crowd_decay: float = 2.5e-3
     rigid_final_factor: float = 0.17
+    shell: float = 0.0
     name: str = "fine"
 
     def __post_init__(self) -> None:
@@ -147,7 +150,7 @@ class Numbers:
             (("edges", "relink"), "a whole number >= 1", lambda value: value >= 1 and value == int(value)),
             (("opacity_decay", "crowd_decay"), "a number in [0, 1)", lambda value: 0 <= value < 1),
             (
-                ("density_until", "rest_from", "jitter", "time_offsets"),
+                ("density_until", "rest_from", "jitter", "time_offsets", "shell"),
                 "a number >= 0",
                 lambda value: value >= 0,
             ),

@@ -32,7 +32,7 @@ from forewarp.ops.gaussians import (
 from forewarp.ops.grid import dilate
 from forewarp.ops.nodes import carry_nodes, pull_nodes, skin_weights, spread_nodes
 from forewarp.scene.box import Box, Lattice
-from forewarp.scene.camera import Camera, Lens
+from forewarp.scene.camera import Camera, Lens, Rays
 from forewarp.scene.cloud import Cloud, nearest
 from forewarp.scene.frame import Frame, Scene, spread, visual_hull
 
@@ -46,6 +46,8 @@ _DEPTHS = 48  # planes of a sweep, evenly in inverse depth
 _WHOLLY = 0.999  # share of a pixel from which on all of it is learned from
 _SIDE = 64  # lattice points along the longer side of an image
 _SWEPT, _NEIGHBOURS = 10, 8  # images that are swept; neighbours in time of each
+_DOUBT = 0.02  # of full scale, by which colours must be more alike where no plane was expected
+_SHELLED = 24  # images without a hole once points lie behind all
 _NEAREST_PLANE = 0.02  # share of the far plane at which planes begin at the earliest
 
 _MEASURED = 32  # images whose measured depths are looked at
@@ -56,12 +58,12 @@ _BEHIND = 0.1  # share of a distance by which what lies behind another thing is 
 _PATIENCE_S = 120.0  # that the other compiling process is waited for
 
 
-def first_points(start: Start, count: int) -> Cloud:
+def first_points(start: Start, count: int, shell: float = 0.0) -> Cloud:
     """Find at most about ``count`` points to begin with, and their colours.
 
     Of the first that there is: what the stage before left; the visual hull, where images have alpha; places
-    at measured depths; points that are known to stand still with what neighbouring views agree on; random
-    points of the box.
+    at measured depths; points that are known to stand still with what neighbouring views agree on (``shell``:
+    see ``swept``); random points of the box.
 
     Cost: of the hull, about a second; of neighbouring views, a few.
     """
@@ -75,7 +77,7 @@ def first_points(start: Start, count: int) -> Cloud:
     if cloud is None:
         cloud = measured(scene, count)
     if cloud is None:
-        cloud = swept(scene, list(start.frames), count)
+        cloud = swept(scene, list(start.frames), count, shell)
     if cloud is None or len(cloud) < _FEW:
         cloud = anywhere(scene.box, count)
     return cloud if len(cloud) <= count else cloud[torch.randperm(len(cloud))[:count].sort().values]
@@ -151,8 +153,12 @@ def widths(scene: Scene, points: Tensor, covered: float) -> Tensor:
     return pixel * (covered / max(len(points), 1)) ** 0.5
 
 
-def first_values(cloud: Cloud, widest: Tensor | None = None) -> dict[str, Tensor]:
+def first_values(
+    cloud: Cloud, widest: Tensor | None = None, beyond: Tensor | None = None
+) -> dict[str, Tensor]:
     """Make round particles at points, as large as the points are apart, but no larger than ``widest`` (N,).
+
+    Those ``beyond`` (N,) bool the box may be many times as large as the others.
 
     Points of a sweep lie at uncertain depths, so that they are farther apart in space than in the images: as
     large as that, particles would blur what they show, and many steps would go into making them smaller.
@@ -162,6 +168,8 @@ def first_values(cloud: Cloud, widest: Tensor | None = None) -> dict[str, Tensor
     apart = squared[:, 1:].sqrt().mean(-1) if squared.shape[1] > 1 else torch.full((len(points),), cloud.size)
     median = float(apart.median()) or cloud.size
     size = apart.clamp(0.1 * median, 4 * median)
+    if beyond is not None:
+        size = torch.where(beyond, apart, size)
     if widest is not None:
         size = torch.minimum(size, widest.clamp(min=1e-3 * median))
     quaternions = torch.zeros(len(points), 4)
@@ -227,13 +235,18 @@ def _farthest(points: Tensor, new: Tensor, camera: Camera, step: int) -> Tensor:
     return far[cells_of(new)]
 
 
-def swept(scene: Scene, frames: list[int], count: int) -> Cloud | None:
+def swept(scene: Scene, frames: list[int], count: int, shell: float = 0.0) -> Cloud | None:
     """Find points (about ``count``) that neighbouring views agree on; None where there is a single view.
 
     Each lattice point of an image takes the depth at which its colour is most like what its neighbours in
     time show there, the best half of them counted. Images come one after the other, and each adds only what
     fills its holes: what stands before points that are there already is mostly a wrong depth, or what has
     moved meanwhile. Points known to stand still are kept.
+
+    Args:
+        scene, frames, count: see above; frames in play go first.
+        shell: 0: nothing lies outside the box. Else, of what is not found in it, how far planes reach, in far
+            planes (at least 1); and there lie points wherever an image shows none: no ray goes past all.
     """
     if len(scene.train) < 2:
         return None
@@ -245,12 +258,18 @@ def swept(scene: Scene, frames: list[int], count: int) -> Cloud | None:
     points, colors, sizes = [still], [seen_colors(still, cameras, images)], []
     small = cache(partial(_small, scene.train, side))
     low, high = torch.tensor(scene.box.low), torch.tensor(scene.box.high)
-    for i in chosen:
-        new, color, size = _sweep(scene, i, side, small, torch.cat(points))
-        fills = ((new >= low) & (new <= high)).all(-1)
-        points.append(new[fills])
-        colors.append(color[fills])
-        sizes.append(size)
+    for beyond in (1.0,) if shell == 0 else (1.0, shell):  # what lies in the box goes first in all images
+        for i in chosen:
+            new, color, size = _sweep(scene, i, side, small, torch.cat(points), beyond)
+            fills = ((new >= low) & (new <= high)).all(-1) | (beyond > 1)
+            points.append(new[fills])
+            colors.append(color[fills])
+            sizes += [size] if beyond == 1 else []
+    if shell > 0:
+        for i in spread(len(scene.train), _SHELLED):
+            new, color = _behind(small(i), side, torch.cat(points), shell)
+            points.append(new)
+            colors.append(color)
     points, colors = torch.cat(points), torch.cat(colors)
     if not len(points):
         return None
@@ -294,12 +313,45 @@ def _bent_pixels(width: int, height: int, *inner: float | Lens) -> Tensor:
     return (2 * pixel / torch.tensor([width, height]) - 1).float().reshape(1, height, width, 2)
 
 
-def _sweep(scene: Scene, i: int, side: int, small: _Small, before: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def _sweep(
+    scene: Scene, i: int, side: int, small: _Small, before: Tensor, beyond: float
+) -> tuple[Tensor, Tensor, Tensor]:
     """Return points (P, 3) of an image's lattice at their best depths, their colours, and their size ().
 
-    None is at a pixel that is not valid, or in a cell of the lattice with a point of ``before`` (N, 3).
+    None is at a pixel that is not valid, or in a cell of the lattice with a point of ``before`` (N, 3), or
+    farther than ``beyond`` far planes.
     """
-    rgb, valid, camera = small(i)
+    rays, color, step = _holes(small(i), side, before)
+    camera = small(i)[2]
+    time = scene.train[i].time
+    neighbours = sorted(
+        (j for j in range(len(scene.train)) if j != i),
+        key=lambda j: (abs(scene.train[j].time - time), abs(j - i)),
+    )[:_NEIGHBOURS]
+    near = _nearest_plane(camera, [scene.train[j].camera for j in neighbours])
+    depths = 1 / torch.linspace(1 / near, 1 / (beyond * camera.far), _DEPTHS)
+    points = rays.origins[:, None] + depths[:, None] * rays.directions[:, None]  # (P, D, 3)
+    costs = torch.stack([_difference(points, color, *small(j)) for j in neighbours])
+    best_half = costs.sort(0).values[: max(1, len(neighbours) // 2)].mean(0)
+    best_half += torch.where(depths > camera.far, _DOUBT, 0.0)  # what has no texture fits everywhere
+    depth = depths[best_half.argmin(-1)]
+    points, size = rays.origins + depth[:, None] * rays.directions, depth.median() * step / camera.fx
+    return points, color, size
+
+
+def _behind(image: tuple[Tensor, Tensor, Camera], side: int, before: Tensor, shell: float):
+    """Return points (P, 3) ``shell`` far planes away where an image's lattice shows none of those ``before``
+    (N, 3), and their colours (P, 3).
+    """
+    rays, color, _ = _holes(image, side, before)
+    return rays.origins + shell * image[2].far * rays.directions, color
+
+
+def _holes(image: tuple[Tensor, Tensor, Camera], side: int, before: Tensor) -> tuple[Rays, Tensor, int]:
+    """Return the rays of an image's lattice whose cells hold none of the points ``before`` (N, 3), their
+    colours (P, 3), and how many pixels they are apart. There is none at a pixel that is not valid.
+    """
+    rgb, valid, camera = image
     step = max(1, round(max(camera.width, camera.height) / side))
     rows, columns = torch.meshgrid(
         torch.arange(min(step // 2, camera.height - 1), camera.height, step),
@@ -310,20 +362,7 @@ def _sweep(scene: Scene, i: int, side: int, small: _Small, before: Tensor) -> tu
     rays = camera.rays(rows * camera.width + columns)
     is_hole = _in_holes(before, rays.origins + rays.directions, camera, side)
     is_hole &= valid[rows, columns]  # what is not learned from is no start either
-    rays, color = rays[is_hole], rgb[rows[is_hole], columns[is_hole]]
-    time = scene.train[i].time
-    neighbours = sorted(
-        (j for j in range(len(scene.train)) if j != i),
-        key=lambda j: (abs(scene.train[j].time - time), abs(j - i)),
-    )[:_NEIGHBOURS]
-    near = _nearest_plane(camera, [scene.train[j].camera for j in neighbours])
-    depths = 1 / torch.linspace(1 / near, 1 / camera.far, _DEPTHS)
-    points = rays.origins[:, None] + depths[:, None] * rays.directions[:, None]  # (P, D, 3)
-    costs = torch.stack([_difference(points, color, *small(j)) for j in neighbours])
-    best_half = costs.sort(0).values[: max(1, len(neighbours) // 2)].mean(0)
-    depth = depths[best_half.argmin(-1)]
-    points, size = rays.origins + depth[:, None] * rays.directions, depth.median() * step / camera.fx
-    return points, color, size
+    return rays[is_hole], rgb[rows[is_hole], columns[is_hole]], step
 
 
 def _nearest_plane(camera: Camera, neighbours: Sequence[Camera]) -> float:
