@@ -46,7 +46,7 @@ ONLY_IN = {
     "lightning": {"data", "training", "evaluation", "runs", "planning", "viewer", "cli"},
     **{"torchmetrics": {"metrics"}, "numba": {"ops"}, "PIL": {"data", "report"}, "matplotlib": {"report"}},
     **{"trimesh": {"synth"}, "embreex": {"synth"}, "torchvision": set()},
-    **{"pycolmap": {"capture"}, "cv2": {"capture"}},
+    **{"pycolmap": {"capture"}, "cv2": {"capture"}, "lzfse": {"capture"}},
     **{"skimage": {"export"}, "viser": {"export", "viewer", "cli"}},
     **{"imageio": {"drawing", "evaluation", "cli"}, "imageio_ffmpeg": {"drawing", "data", "cli"}},
     "rich": {"progress", "training", "evaluation", "planning", "cli"},

@@ -6,7 +6,8 @@ cameras' poses from what stands still, and writes what experiment=video_with_pos
   forewarp-train experiment=video_with_poses data.root=captures data.scene=hand
 
 What one types most:
-  video=FILE                    a video; its rotation flag and its own time stamps are heeded
+  video=FILE                    a video; its rotation flag and its own time stamps are heeded. A scan of
+                                Record3D (.r3d) has poses and measured depth of its own
   videos=FOLDER                 or a video of each of several cameras, which film one scene (see below)
   images=FOLDER                 or pictures of one size, in the order of their names
   colmap=FOLDER                 poses that are known: a COLMAP model, of the pictures in images=
@@ -35,6 +36,8 @@ After Ctrl-C the same command goes on.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from forewarp.cli.entry import command
 from forewarp.runs.config import check_seed
 from forewarp.runs.overrides import command_line, text_override
@@ -48,25 +51,31 @@ RIG = {
     "rate": None,
 }  # keys of several cameras, and none of them
 LEAST_HELD = 4  # cameras from which on one is held out by the command that comes next
+SUFFIX = ".r3d"  # of scans by Record3D
 LENSES = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
 
 
 def capture(config) -> None:
     """Make a scene, and say what was found."""
-    from pathlib import Path
-
     from omegaconf import OmegaConf
 
     source, out = check(config)
     # These load torch; mistakes have been answered before.
     from forewarp.capture import rig, scene
     from forewarp.capture.frames import Source
-    from forewarp.capture.pipeline import PICTURE, capture
+    from forewarp.capture.pipeline import capture
     from forewarp.capture.poses import Search
     from forewarp.progress import Counted
 
     if type(config.force) is not bool:
         raise ValueError(f"force: expected true or false, but got {config.force}")
+    if source["video"] is not None and source["video"].suffix == SUFFIX:
+        from forewarp.capture import record3d
+        from forewarp.capture.pipeline import ABOUT
+
+        facts = record3d.capture_record3d(source["video"], out, Counted, ABOUT, config.frames)
+        tell(record3d.summary(facts), out)
+        return
     search = Search(config.matching, config.lens, config.features, config.seed, config.threads)
     options = {"frames": config.frames, "size": config.size, "force": config.force}
     videos, held = source.pop("videos"), []
@@ -78,9 +87,16 @@ def capture(config) -> None:
         facts = rig.capture_rig(videos, out, search, Counted, masks=source["masks"], **options)
         lines, posed = rig.summary(facts), [name for name in facts["cameras"] if name not in facts["lost"]]
         held = [f"data.test_cameras=[{posed[0]}]"] if len(posed) >= LEAST_HELD else []
+    tell(lines, out, held)
+
+
+def tell(lines: list[str], out, held: Sequence[str] = ()) -> None:
+    """Print what was found, where it is, and the command that comes next."""
+    from forewarp.capture.pipeline import PICTURE
+
     for line in lines:
         print(line)
-    drawn = Path(out) / PICTURE
+    drawn = out / PICTURE
     print(f"written: {out}" + (f"; see {drawn}" if drawn.is_file() else ""))
     where = [text_override("data.root", str(out.parent)), text_override("data.scene", out.name), *held]
     print(f"next: {command_line('train', ['experiment=video_with_poses', *where])}")
@@ -131,7 +147,10 @@ def check(config) -> tuple[dict, object]:
     for key, known in (("matching", MATCHING), ("lens", LENSES)):
         if config[key] not in known:
             raise ValueError(f"{key}: expected one of {', '.join(known)}, but got '{config[key]}'")
-    for package in ("pycolmap", "cv2"):
+    is_scan = video is not None and video.suffix == SUFFIX
+    if typed := [key for key in ("masks", "colmap") if is_scan and source[key] is not None]:
+        raise ValueError(f"{typed[0]}: expected none beside a scan of Record3D, but got one; remove it")
+    for package in ("pycolmap", "cv2", *(["lzfse"] if is_scan else [])):
         if find_spec(package) is None:
             raise ImportError(f"capture: expected {package}, but got none; install forewarp[capture]")
     out = Path(config.out or Path("captures") / (video or videos or images).resolve().stem)

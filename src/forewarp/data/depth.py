@@ -18,7 +18,7 @@ from forewarp.scene.frame import spread
 
 SUFFIXES, KINDS = (".npy", ".png"), ("metric", "relative", "inverse")
 MILLIMETRES = 1e-3
-_LEVELS = 2  # of ARKit's confidence: 0 low, 1 medium, 2 high
+LEVELS = 2  # of ARKit's confidence: 0 low, 1 medium, 2 high
 _LOOKED_AT = 4  # files that tell the unit
 _NEAR, _LEAST, _AGREE, _LINES = 0.05, 10, 0.4, 400  # of a fit: share, points, share of them, lines tried
 _BEYOND = 2.0  # share of near and far within which the median of depths of the right unit lies
@@ -176,7 +176,7 @@ def _read_confidence(path: Path) -> np.ndarray:
     values = values[..., 0] if getattr(values, "ndim", 0) == 3 else values
     if getattr(values, "ndim", 0) != 2 or values.dtype.kind not in "iuf" or not values.size:
         raise mismatch(path, "confidences (H, W)", f"shape {getattr(values, 'shape', ())}")
-    most = 1.0 if values.dtype.kind == "f" else float(_LEVELS if values.max() <= _LEVELS else 255)
+    most = 1.0 if values.dtype.kind == "f" else float(LEVELS if values.max() <= LEVELS else 255)
     if not (values.min() >= 0 and values.max() <= most):
         got = f"values from {values.min():g} to {values.max():g}"
         raise mismatch(path, "confidences from 0 to 1, or levels 0, 1, 2", got)

@@ -25,7 +25,7 @@ from torch import Tensor
 
 from forewarp.data.arrays import read_cloud, write_array
 from forewarp.data.cameras import MOST_UNITS, SPLITS, box_of, opengl_rows, space_of
-from forewarp.data.depth import KINDS, MILLIMETRES, SensedDepth, confidence_of, depths_beside
+from forewarp.data.depth import KINDS, LEVELS, MILLIMETRES, SensedDepth, confidence_of, depths_beside
 from forewarp.data.directions import check_directions
 from forewarp.data.files import (
     frames_of,
@@ -84,7 +84,7 @@ class PosedShot:
     straight alpha; ``camera`` of that size, its near and far are not written; ``time`` in [0, 1] or None;
     ``split`` train, val or test, or "" where the reader is to choose; ``moving`` bool (H, W), what moves, or
     None where it is not known; ``taken_by`` the name of the camera, of a rig, and ``moment`` the number of
-    the instant, from 0.
+    the instant, from 0; ``depth`` (H', W') along the optical axis and its ``confidence``, as measured.
     """
 
     name: str
@@ -95,6 +95,8 @@ class PosedShot:
     moving: np.ndarray | None = None
     taken_by: str | None = None
     moment: int | None = None
+    depth: np.ndarray | None = None
+    confidence: np.ndarray | None = None
 
 
 def read_scene(
@@ -538,6 +540,13 @@ def _write_shot(folder: Path, shot: PosedShot, taken: set[str]) -> dict:
     if shot.moment is not None:
         entry["moment"] = shot.moment
     write_image(folder / entry["file_path"], pixels)
+    if shot.depth is not None:
+        entry["depth_file_path"] = f"depth/{shot.name.removesuffix(suffix)}.npy"
+        write_array(folder / entry["depth_file_path"], shot.depth)
+    if shot.confidence is not None:
+        trust = np.asarray(shot.confidence)
+        trust = trust / LEVELS if trust.dtype.kind in "iu" else trust
+        write_array(folder / f"confidence/{shot.name.removesuffix(suffix)}.npy", trust)
     if shot.moving is not None:
         mask = np.uint8(255) * np.asarray(shot.moving, bool)
         entry["moving_path"] = f"moving/{shot.name.removesuffix(suffix)}.png"

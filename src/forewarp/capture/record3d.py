@@ -1,0 +1,188 @@
+"""A scan by Record3D, on a phone that measures depth, to a scene: poses, depths and confidences are its own.
+
+An ``.r3d`` is a ZIP archive. ``metadata`` is JSON: ``w h`` and ``dw dh`` are the sizes of images and depths;
+``poses`` has of each frame the quaternion x, y, z, w of a camera-to-world rotation with OpenGL's axes, and
+the camera's place in metres; ``K`` is the camera matrix, column by column; ``perFrameIntrinsicCoeffs``, where
+it is there, is fx, fy, cx, cy of each frame; ``frameTimestamps`` are seconds, or ``fps`` frames a second.
+``rgbd/<i>.jpg`` is an image, ``rgbd/<i>.depth`` float32 metres along the optical axis and ``rgbd/<i>.conf`` a
+byte for each, ARKit's level 0, 1 or 2; both are compressed by LZFSE.
+"""
+
+from __future__ import annotations
+
+import json
+import zipfile
+from collections.abc import Iterator
+from pathlib import Path
+from reprlib import repr as short
+
+import numpy as np
+import torch
+
+from forewarp.capture.frames import Step, shrunk
+from forewarp.data.directions import opposite
+from forewarp.data.files import mismatch, number
+from forewarp.data.images import by, read_image, write_image
+from forewarp.data.posed_video import PosedShot, write_scene
+from forewarp.files import folder_written_whole, write_json
+from forewarp.ops.gaussians import rotations
+from forewarp.scene.camera import Camera
+from forewarp.scene.frame import spread
+
+_MOST_SIDE, _MOST_UNITS, _MOST_BYTES = 1e5, 1e6, 200_000_000
+_SAMPLED, _SMALLER = 16, 2  # depths that tell near and far; how many times smaller the copies are
+_ENDS = ((0.001, 0.75), (0.999, 1.25))  # of near and far: quantile of all depths, and room beside it
+
+
+def capture_record3d(scan: Path, out: Path, step: Step, mark: str, frames: int | None = None) -> dict:
+    """Make a scene in ``out`` of a scan, and return what was found, which the file ``mark`` there holds too.
+
+    Args:
+        scan: the ``.r3d``.
+        out: the scene's folder; an earlier capture in it is replaced.
+        step: gives a ``Progress``.
+        mark: see ``folder_written_whole``.
+        frames: most frames, evenly spread; None: all.
+
+    Raises:
+        SceneError: in a line, for what is missing or wrong in the archive; ImportError: without ``lzfse``.
+    """
+    try:
+        archive = zipfile.ZipFile(scan)
+    except (OSError, zipfile.BadZipFile) as error:
+        raise mismatch(scan, "a scan of Record3D, a ZIP archive", "another file") from error
+    with archive:
+        read = _Scan(scan, archive)
+        chosen = spread(len(read.poses), frames or len(read.poses))
+        depths = [read.depth(chosen[k]) for k in spread(len(chosen), _SAMPLED)]
+        there = np.concatenate([depth[depth > 0] for depth in depths])
+        if not there.size:
+            raise mismatch(f"{scan}: rgbd/*.depth", "depths above 0", "holes alone")
+        near, far = (float(np.quantile(there, share)) * room for share, room in _ENDS)
+        first, last = (read.times[chosen[k]] for k in (0, -1))
+        with folder_written_whole(out, mark) as folder, step("frames") as progress:
+
+            def shots() -> Iterator[PosedShot]:
+                for done, i in enumerate(chosen, 1):
+                    name = f"{i:06d}.jpg"
+                    (folder / "images").mkdir(exist_ok=True)
+                    (folder / "images" / name).write_bytes(read.member(f"rgbd/{i}.jpg"))
+                    pixels = read_image(folder / "images" / name, read.size)[..., :3].numpy()
+                    height, width = (n // _SMALLER for n in pixels.shape[:2])
+                    small = shrunk(pixels[: height * _SMALLER, : width * _SMALLER], height, width)
+                    write_image(folder / f"images_{_SMALLER}" / name, small)
+                    time, evidence = (read.times[i] - first) / ((last - first) or 1.0), read.confidence(i)
+                    camera = read.camera(i)
+                    yield PosedShot(name, camera, pixels, time, depth=read.depth(i), confidence=evidence)
+                    progress(done, len(chosen))
+
+            write_scene(folder, shots(), near=near, far=far, seconds=last - first)
+            facts = {"source": str(scan), "pictures": len(chosen), "found": len(read.poses)}
+            facts |= {"size": list(read.size), "depth": list(read.of_depth), "seconds": last - first}
+            facts |= {"near": near, "far": far}
+            write_json(folder / mark, facts)
+    return facts
+
+
+def summary(facts: dict) -> list[str]:
+    """Say what was found in a few lines."""
+    size, of_depth, near, far = by(facts["size"]), by(facts["depth"]), facts["near"], facts["far"]
+    return [
+        f"frames: {facts['pictures']} of {facts['found']}, {size} pixels, {facts['seconds']:.1f} s",
+        f"depth: {of_depth}, near {near:.2f} and far {far:.2f} metres; poses are the phone's",
+    ]
+
+
+class _Scan:
+    """What an open archive holds, checked: ``size``, ``of_depth`` (width, height), ``poses``, ``times``."""
+
+    def __init__(self, path: Path, archive: zipfile.ZipFile) -> None:
+        self.path, self.archive = path, archive
+        try:
+            about = json.loads(self.member("metadata"))
+        except ValueError as error:  # of its text, too
+            raise mismatch(f"{path}: metadata", "JSON", str(error)) from error
+        if not isinstance(about, dict):
+            raise mismatch(f"{path}: metadata", "an object", short(about))
+        self.about = about
+        self.size, self.of_depth = (
+            tuple(int(self._number(key, about.get(key), 1, _MOST_SIDE)) for key in keys)
+            for keys in (("w", "h"), ("dw", "dh"))
+        )
+        self.poses = self._rows("poses", 7)
+        if not self.poses:
+            raise mismatch(f"{path}: metadata: poses", "a pose of each frame", "none")
+        self.intrinsics = [self._of_matrix()] * len(self.poses)
+        if about.get("perFrameIntrinsicCoeffs"):
+            self.intrinsics = self._rows("perFrameIntrinsicCoeffs", 4, len(self.poses))
+        if about.get("frameTimestamps"):
+            self.times = [row[0] for row in self._rows("frameTimestamps", 1, len(self.poses))]
+        else:
+            fps = self._number("fps", about.get("fps"), 1e-3, _MOST_SIDE)
+            self.times = [i / fps for i in range(len(self.poses))]
+
+    def camera(self, i: int) -> Camera:
+        """Return the camera of a frame; its near and far are not known."""
+        (x, y, z, w, *place), pose = self.poses[i], torch.eye(4, dtype=torch.float64)
+        q = torch.tensor([w, x, y, z], dtype=torch.float64)
+        if not 0.9 < float(q.norm()) < 1.1:
+            raise mismatch(
+                f"{self.path}: metadata: poses[{i}]", "a quaternion of length 1", f"{float(q.norm()):g}"
+            )
+        pose[:3, :3] = rotations(q[None])[0]
+        pose[:3, 3] = torch.tensor(place, dtype=torch.float64)
+        fx, fy, cx, cy = self.intrinsics[i]
+        return Camera(*self.size, fx, fy, cx, cy, opposite(pose[None])[0], 0.0, 1.0)
+
+    def depth(self, i: int) -> np.ndarray:
+        """Return metres (H, W) float32 along the optical axis, 0 where there is none."""
+        depth = self._plane(f"rgbd/{i}.depth", np.float32)
+        return np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0))
+
+    def confidence(self, i: int) -> np.ndarray | None:
+        """Return levels (H, W) uint8, or None where there are none."""
+        name = f"rgbd/{i}.conf"
+        return self._plane(name, np.uint8) if name in self.archive.NameToInfo else None
+
+    def member(self, name: str) -> bytes:
+        """Return the bytes of a file in the archive."""
+        where = f"{self.path}: {name}"
+        if name not in self.archive.NameToInfo:
+            raise mismatch(where, "this file in the archive", "none")
+        if (size := self.archive.getinfo(name).file_size) > _MOST_BYTES:
+            raise mismatch(where, f"at most {_MOST_BYTES} bytes", size)
+        try:
+            return self.archive.read(name)
+        except Exception as error:  # BadZipFile, zlib.error, RuntimeError and more
+            raise mismatch(where, "a whole file", f"one that cannot be unpacked ({error})") from error
+
+    def _plane(self, name: str, kind: type) -> np.ndarray:
+        import lzfse
+
+        (width, height), where = self.of_depth, f"{self.path}: {name}"
+        try:
+            raw = lzfse.decompress(self.member(name))
+        except lzfse.error as error:
+            raise mismatch(where, "data compressed by LZFSE", "others") from error
+        if len(raw) != width * height * np.dtype(kind).itemsize:
+            raise mismatch(where, f"{width} x {height} numbers as dw and dh say", f"{len(raw)} bytes")
+        return np.frombuffer(raw, kind).reshape(height, width)
+
+    def _rows(self, key: str, columns: int, count: int | None = None) -> list[list[float]]:
+        rows, where = self.about.get(key), f"{self.path}: metadata: {key}"
+        if not isinstance(rows, list) or (count is not None and len(rows) != count):
+            expected = "a list" if count is None else f"a list of {count}, as there are poses"
+            raise mismatch(where, expected, short(rows))
+        rows = [row if isinstance(row, list) else [row] for row in rows]
+        if wrong := [row for row in rows if len(row) != columns]:
+            raise mismatch(where, f"{columns} numbers for each frame", short(wrong[0]))
+        return [[self._number(key, value) for value in row] for row in rows]
+
+    def _of_matrix(self) -> list[float]:
+        matrix = self.about.get("K")
+        if not isinstance(matrix, list) or len(matrix) != 9:
+            raise mismatch(f"{self.path}: metadata: K", "9 numbers", short(matrix))
+        return [self._number("K", matrix[k]) for k in (0, 4, 6, 7)]
+
+    def _number(self, key: str, value: object, low: float = -_MOST_UNITS, high: float = _MOST_UNITS) -> float:
+        return number(value, f"{self.path}: metadata: {key}", low, high)

@@ -1,0 +1,127 @@
+"""Scans by Record3D: an archive of our own making, after public descriptions, becomes a scene with depth."""
+
+import io
+import json
+import zipfile
+from contextlib import nullcontext
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+pytest.importorskip("pycolmap", reason="no pycolmap; make install adds it")
+pytest.importorskip("lzfse", reason="no lzfse; make install adds it")
+
+import lzfse
+
+from forewarp.capture.record3d import capture_record3d, summary
+from forewarp.data.files import SceneError
+from forewarp.data.posed_video import read_scene
+
+SIZE, DEPTH = (36, 48), (9, 12)  # width, height
+
+
+def poses(count):
+    """Cameras 3 m from the origin that look at it along their -z, on a circle about y."""
+    for i in range(count):
+        half = 0.1 * i / 2
+        turned = 3 * np.sin(2 * half), 0.2, 3 * np.cos(2 * half)
+        yield [0.0, float(np.sin(half)), 0.0, float(np.cos(half)), *map(float, turned)]
+
+
+def write_scan(path, count=9, **changes):
+    """Write an archive; ``changes`` are of its metadata, or of its files by name, None: without."""
+    about = {"w": SIZE[0], "h": SIZE[1], "dw": DEPTH[0], "dh": DEPTH[1], "fps": 30}
+    about |= {"K": [50.0, 0, 0, 0, 51.0, 0, 17.0, 25.0, 1], "poses": list(poses(count))}
+    rng, files = np.random.default_rng(0), {}
+    for i in range(count):
+        image, depth = io.BytesIO(), np.full(DEPTH[::-1], 3 + 0.1 * i, np.float32)
+        Image.fromarray(rng.integers(0, 256, (*SIZE[::-1], 3), dtype=np.uint8)).save(
+            image, "JPEG", quality=95
+        )
+        depth[0, :3] = [np.nan, 0, -1]
+        trust = np.full(depth.shape, 2, np.uint8)
+        trust[1, :2] = [0, 1]
+        files[f"rgbd/{i}.jpg"] = image.getvalue()
+        files[f"rgbd/{i}.depth"] = lzfse.compress(depth.tobytes())
+        files[f"rgbd/{i}.conf"] = lzfse.compress(trust.tobytes())
+    files |= {name: value for name, value in changes.items() if "/" in name}
+    about |= {name: value for name, value in changes.items() if "/" not in name}
+    files["metadata"] = json.dumps(about).encode()
+    with zipfile.ZipFile(path, "w") as archive:
+        for name, content in files.items():
+            if content is not None:
+                archive.writestr(name, content)
+    return path
+
+
+def captured(scan, out, **options):
+    return capture_record3d(
+        scan, out, lambda title: nullcontext(lambda *done: None), "capture.json", **options
+    )
+
+
+def test_a_scan_becomes_a_scene_with_its_poses_and_depth(tmp_path):
+    facts = captured(write_scan(tmp_path / "a.r3d"), tmp_path / "a")
+    assert json.loads((tmp_path / "a" / "capture.json").read_text()) == facts
+    assert summary(facts)[0] == "frames: 9 of 9, 36 x 48 pixels, 0.3 s"
+    scene = read_scene(tmp_path, "a", normalise=False)
+    assert scene.protocol["depth"] == f"metric, of {len(scene.train)} of {len(scene.train)} training frames"
+    assert scene.protocol["seconds"] == pytest.approx(8 / 30)
+    frame = scene.train[2]
+    assert (frame.time, frame.name) == (pytest.approx(0.25), "images/000002")
+    camera = frame.camera
+    assert (camera.fx, camera.fy, camera.cx, camera.cy) == (50, 51, 17, 25)
+    _, ahead = camera.project(torch.zeros(3, dtype=torch.float64))
+    assert ahead.item() == pytest.approx(3, abs=0.05)  # what is filmed lies before it
+    assert camera.camera_to_world[1, 1].item() == pytest.approx(-1, abs=1e-6)  # y points down
+    depth, trust = frame.load_sensed()
+    along = depth * (camera.rays().directions @ camera.camera_to_world[:3, 2].float()).reshape(depth.shape)
+    assert not depth[:4, :12].any()
+    assert along[20, 20].item() == pytest.approx(3.2, rel=1e-5)
+    assert trust[5, 2::4].tolist()[:3] == [0, 0.5, 1]
+    assert (0.7 * 3 < facts["near"] < 3, facts["far"] > 3.8) == (True, True)
+    assert read_scene(tmp_path, "a", scale=2, normalise=False).train[0].load().shape == (24, 18, 4)
+
+
+def test_frames_may_be_fewer_and_have_times_and_lenses_of_their_own(tmp_path):
+    stamps, lenses = [0.0, 0.1, 0.3, 0.4, 1.0], [[40.0 + i, 41, 18, 24] for i in range(5)]
+    own = {"frameTimestamps": stamps, "perFrameIntrinsicCoeffs": lenses, "rgbd/4.conf": None}
+    captured(write_scan(tmp_path / "a.r3d", 5, **own), tmp_path / "a", frames=3)
+    scene = read_scene(tmp_path, "a", normalise=False, test_every=100)
+    frames = sorted((*scene.train, *scene.test), key=lambda frame: frame.time)
+    assert [frame.time for frame in frames] == pytest.approx([0, 0.3, 1])
+    assert [frame.camera.fx for frame in frames] == [40, 42, 44]
+    assert frames[2].load_sensed()[1].max() == 1  # without confidences all are trusted
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"poses": []}, "metadata: poses: expected a pose of each frame, but got none"),
+        ({"poses": [[0.0] * 7] * 9}, r"poses\[0\]: expected a quaternion of length 1, but got 0"),
+        ({"poses": [[0.0] * 6] * 9}, "metadata: poses: expected 7 numbers for each frame, but got"),
+        ({"K": [1.0]}, r"metadata: K: expected 9 numbers, but got \[1.0\]"),
+        ({"dw": None}, "metadata: dw: expected a number"),
+        ({"frameTimestamps": [1.0]}, "frameTimestamps: expected a list of 9, as there are poses, but got"),
+        ({"rgbd/4.depth": b"nothing"}, "rgbd/4.depth: expected data compressed by LZFSE, but got others"),
+        (
+            {"rgbd/4.depth": lzfse.compress(bytes(8))},
+            "4.depth: expected 9 x 12 numbers as dw and dh say, but got 8",
+        ),
+        ({"rgbd/4.jpg": None}, "rgbd/4.jpg: expected this file in the archive, but got none"),
+        ({"w": 40}, "000000.jpg: expected 40 x 48 pixels, but got 36 x 48"),
+    ],
+)
+def test_what_is_wrong_in_a_scan_is_told_in_a_line(tmp_path, changes, message):
+    with pytest.raises(SceneError, match=message) as caught:
+        captured(write_scan(tmp_path / "a.r3d", **changes), tmp_path / "a")
+    assert "\n" not in str(caught.value)
+    assert not (tmp_path / "a").exists()
+
+
+def test_another_file_is_no_scan(tmp_path):
+    (tmp_path / "a.r3d").write_bytes(b"text")
+    with pytest.raises(SceneError, match="expected a scan of Record3D, a ZIP archive, but got another file"):
+        captured(tmp_path / "a.r3d", tmp_path / "a")
