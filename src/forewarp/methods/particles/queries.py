@@ -103,10 +103,12 @@ def bounds(self: Particles, times: list[float]) -> Box | None:
     solid = torch.sigmoid(most_opaque(self)) > _SOLID
     if not bool(solid.any()):
         return None
-    points = torch.cat([moved(self.means.data, self.warp(time))[0][solid] for time in times])
+    low, high = self.means.new_full((3,), torch.inf), self.means.new_full((3,), -torch.inf)
+    for time in times:  # one at a time, as all places of all particles may take gigabytes
+        points = moved(self.means.data, self.warp(time))[0][solid]
+        low, high = torch.minimum(low, points.amin(0)), torch.maximum(high, points.amax(0))
     pad = 2 * float(self.scales[solid].exp().median()) + 1e-3 * float(self.extent)
-    low, high = points.amin(0) - pad, points.amax(0) + pad
-    return Box(tuple(low.tolist()), tuple(high.tolist()))
+    return Box(tuple((low - pad).tolist()), tuple((high + pad).tolist()))
 
 
 def matter(self: Particles) -> Cloud:
