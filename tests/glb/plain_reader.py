@@ -165,8 +165,44 @@ class PlainScene:
         document, blob = chunks(path)
         node = next(n for n in document["nodes"] if "mesh" in n)
         primitive = document["meshes"][node["mesh"]]["primitives"][0]
-        self.about = about = primitive["extensions"][SPLATS]["extensions"][MOTION]
-        assert (about["version"].split(".")[0], about.get("features", [])) == ("1", [])
+        about = primitive["extensions"][SPLATS]["extensions"][MOTION]
+        assert about["version"].split(".")[0] == "1"
+        assert {*about.get("features", [])} <= {"windows"}
+        self.windows = [PlainWindow(document, blob, primitive, about)]
+        self.limits, self.fade = [(0.0, 0.0, 1.0)], 0.0  # shown from; its own times 0 and 1
+        if "windows" in about:
+            windows, first = about["windows"]["list"], self.windows[0]
+            self.fade = about["windows"].get("fade", 0.0)
+            self.limits = [(window["from"], *window["span"]) for window in windows]
+            for window in windows[1:]:
+                part = document["meshes"][window["mesh"]]["primitives"][0]
+                self.windows.append(PlainWindow(document, blob, part, about, first))
+        children = (document["nodes"][i] for i in node.get("children", []))
+        self.cameras = [view(document, child) for child in children if "camera" in child]
+        self.background = self.windows[0].background
+
+    def render(self, camera, time):
+        """Return the image (H, W, 3) that a camera (an entry of ``cameras``) sees at a time."""
+        number = max(n for n, (begin, _, _) in enumerate(self.limits) if begin <= time)
+        shares = {number: 1.0}
+        for seam in range(1, len(self.limits)):
+            after = time - self.limits[seam][0]
+            if abs(after) < self.fade:
+                share = 0.5 + after / (2 * self.fade)
+                shares = {seam - 1: 1 - share, seam: share}
+        image = 0
+        for number, share in shares.items():
+            _, first, last = self.limits[number]
+            image = image + share * self.windows[number].render(camera, (time - first) / (last - first))
+        return image
+
+
+class PlainWindow:
+    """The Gaussians of a primitive, and those that it shares with the ``first`` one of ``setting``."""
+
+    def __init__(self, document, blob, primitive, setting, first=None):
+        own = primitive["extensions"][SPLATS]["extensions"][MOTION]
+        self.about = about = setting | {"curve": None, "moving": 0} | own
         read = lambda number: array(document, blob, number)  # noqa: E731
         reads = lambda numbers: np.array([read(number) for number in numbers])  # noqa: E731
         named = primitive["attributes"]
@@ -180,13 +216,22 @@ class PlainScene:
             self.links = np.hstack(reads(about["links"])).astype(int)
             weights = np.hstack(reads(about["weights"]))
             self.weights = weights / weights.sum(1, keepdims=True)
-        self.offsets = {name: read(number)[:, 0] for name, number in about.get("timeOffsets", {}).items()}
-        self.color_over_time = reads(about.get("colorOverTime", []))
-        self.opacity_over_time = [read(number)[:, 0] for number in about.get("opacityOverTime", [])]
-        self.logit = read(about["opacityLogits"])[:, 0] if "opacityLogits" in about else None
-        self.background = np.array(about.get("background", [1, 1, 1]))
-        children = (document["nodes"][i] for i in node.get("children", []))
-        self.cameras = [view(document, child) for child in children if "camera" in child]
+        self.offsets = {name: read(number)[:, 0] for name, number in own.get("timeOffsets", {}).items()}
+        self.color_over_time = reads(own.get("colorOverTime", []))
+        self.opacity_over_time = [read(number)[:, 0] for number in own.get("opacityOverTime", [])]
+        self.logit = read(own["opacityLogits"])[:, 0] if "opacityLogits" in own else None
+        self.background = np.array(setting.get("background", [1, 1, 1]))
+        if first is not None and (many := setting["windows"]["shared"]):
+            for name in ("centers", "axes", "opacity", "logit"):
+                if getattr(self, name) is not None:
+                    both = getattr(self, name), getattr(first, name)[-many:]
+                    setattr(self, name, np.concatenate(both))
+            for name in ("harmonics", "color_over_time"):
+                if len(getattr(self, name)):
+                    both = getattr(self, name), getattr(first, name)[:, -many:]
+                    setattr(self, name, np.concatenate(both, 1))
+            pairs = zip(self.opacity_over_time, first.opacity_over_time)
+            self.opacity_over_time = [np.concatenate([a, b[-many:]]) for a, b in pairs]
 
     def maps(self, time):
         """Return ``D`` (M, 3, 3) and ``d`` (M, 3) of the nodes."""

@@ -221,7 +221,7 @@ def in_motion(*path_and_value):
 
 COMPRESSED = ("bufferViews", 0, "extensions", "EXT_meshopt_compression")
 WRONG = {
-    "another major version": (in_motion("version", "2.0"), "expected version 1.0, but got '2.0'"),
+    "another major version": (in_motion("version", "2.0"), "expected version 1.1, but got '2.0'"),
     "no version": (in_motion("version", None), "version: expected a text, but got none"),
     "an unknown feature": (in_motion("features", ["births"]), "features known here, but got 'births'"),
     "an unknown extension": (setter(["extensionsRequired"], ["KHR_x"]), "known here, but got 'KHR_x'"),

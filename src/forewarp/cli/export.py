@@ -5,7 +5,7 @@ forewarp-export writes a finished run for other programs, into its exports/<form
   forewarp-export run=FOLDER format=npz times=[0,0.5,1] points=500
 
 What one types most:
-  run=FOLDER                    the run (needed)
+  run=FOLDER                    the run (needed); glb, html: or the folder of a film's windows
   format=ply                    particles for viewers of Gaussian splats, a file a time; voxels as points
   format=glb                    particles with all of their motion, one small file (docs/format.md)
   format=usd                    particles with time samples, for programs of OpenUSD 26.03 and later
@@ -45,15 +45,15 @@ if TYPE_CHECKING:
 
 
 def export(config) -> None:
-    """Load a run and write it."""
+    """Load a run, or those of a film's windows, and write it."""
+    from dataclasses import replace
     from pathlib import Path
 
     from forewarp.export.formats import ABOUT, FORMATS, write
     from forewarp.files import check_replaceable
-    from forewarp.runs.config import saved_config
 
-    saved = saved_config(config.run, config)
-    times = check(config)
+    saved = saved_runs(config)
+    times = check(config, len(saved))
     folder = Path(config.out or Path(config.run) / "exports" / config.format)
     check_replaceable(folder, ABOUT)
     # These load torch; mistakes have been answered before.
@@ -61,15 +61,35 @@ def export(config) -> None:
     from forewarp.progress import Counted
     from forewarp.runs.fitted import method_name, opened
 
-    run, module = opened(saved)
-    module.method = layer_of(module.method, config.layer, run.datamodule.scene.train)
-    source = source_of(run, module, method_name(saved), times)
+    sources = []
+    for one in saved:
+        run, module = opened(one)
+        module.method = layer_of(module.method, config.layer, run.datamodule.scene.train)
+        sources.append(source_of(run, module, method_name(one), times))
+    whole = {"later": sources[1:]} if len(sources) > 1 else {"span": (0.0, 1.0), "begin": 0.0}
+    source = replace(sources[0], **whole)
     about = {"run": str(config.run), "scene": source.name, "method": source.model, "layer": config.layer}
     options = {name: config[name] for name in FORMATS[config.format].options}
     with Counted(config.format) as progress:
         written = write(config.format, source, folder, about, progress, **options)
     files = list(written["bytes"])
     print(f"written: {folder / files[0] if len(files) == 1 else folder}: {summary(written)}")
+
+
+def saved_runs(config) -> list:
+    """Return the config of the run, or those of the windows in a folder of them, in their order."""
+    from pathlib import Path
+
+    from forewarp.runs.config import saved_config
+    from forewarp.runs.windows import check_film
+
+    inner = [] if config.run is None else sorted(Path(config.run).glob("*/config.yaml"))
+    if not inner or (Path(config.run) / "config.yaml").is_file():
+        return [saved_config(config.run, config)]
+    found = [saved_config(str(place.parent), config) for place in inner]
+    windows = sorted((one for one in found if one.data.get("window")), key=lambda one: one.data.window[0])
+    check_film([tuple(one.data.window) for one in windows], Path(config.run))
+    return windows
 
 
 def source_of(run: Run, module: DynamicSceneModule, model: str, times: Sequence[float]) -> Source:
@@ -79,7 +99,9 @@ def source_of(run: Run, module: DynamicSceneModule, model: str, times: Sequence[
     frames = run.datamodule.scene.train
     cameras, taken = [frame.camera for frame in frames], [frame.time for frame in frames]
     background = tuple(run.datamodule.targets("train").background.tolist())
-    return Source(module, model, cameras, times, background, run.datamodule.scene.name, taken)
+    scene = run.datamodule.scene
+    place = tuple(scene.protocol.get("span", (0.0, 1.0))), scene.protocol.get("window", [0.0])[0]
+    return Source(module, model, cameras, times, background, scene.name, taken, *place)
 
 
 def summary(about: dict) -> str:
@@ -100,8 +122,13 @@ def summary(about: dict) -> str:
     return text
 
 
-def check(config) -> list[float]:
-    """Refuse settings of which nothing can be written, before anything is loaded; return the times."""
+def check(config, windows: int = 1) -> list[float]:
+    """Refuse settings of which nothing can be written, before anything is loaded; return the times.
+
+    Args:
+        config: the command's.
+        windows: how many there are of the film.
+    """
     from omegaconf import ListConfig
 
     from forewarp.export.formats import FORMATS, check_option, require
@@ -109,6 +136,10 @@ def check(config) -> list[float]:
 
     if config.format not in FORMATS:
         raise ValueError(f"format: expected one of {', '.join(FORMATS)}, but got '{config.format}'")
+    if windows > 1 and FORMATS[config.format].times:
+        raise ValueError(
+            f"format: expected glb or html for a film's windows, but got {config.format}; export one of them"
+        )
     options = FORMATS[config.format].options
     foreign = {option for form in FORMATS.values() for option in form.options} - set(options)
     for key in map(key_of, typed_overrides()):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -9,8 +11,8 @@ from torch import Tensor
 
 from forewarp.export.tracks import Progress, Source, no_progress
 from forewarp.fields.moving import MovingGaussians
-from forewarp.glb.writer import COMPACT, Setting, rows_in_file, write
-from forewarp.methods.method import HasBounds, HasLayers, HasMovingGaussians
+from forewarp.glb.writer import COMPACT, Later, Rows, Setting, rows_in_file, write
+from forewarp.methods.method import HasBounds, HasCommon, HasLayers, HasMovingGaussians
 from forewarp.ops.backend import has_kernels
 from forewarp.scene.camera import focus_point
 from forewarp.scene.frame import Frame, spread
@@ -64,12 +66,25 @@ def packed_scene(
         raise ValueError(
             f"format={kind}: expected a method made of particles, but got {source.model}{instead}"
         )
-    gaussians, cameras = source.method.moving().to("cpu"), list(source.cameras)
-    shown = seen_in_images(gaussians, source, progress) if quality == COMPACT else None
-    rows = rows_in_file(gaussians, shown, moving_in_images(source))
-    progress(len(cameras), len(cameras))
-    if not len(rows.order):
+    windows = [source, *source.later]
+    shared = shared_in(windows)
+    count, parts = sum(len(window.cameras) for window in windows), []
+    for window, last in zip(windows, shared):
+        gaussians = window.method.moving().to("cpu")
+        done = sum(len(before.cameras) for before in windows[: len(parts)])
+        tell = partial(_told, progress, done, count)
+        shown = seen_in_images(gaussians, window, tell) if quality == COMPACT else None
+        parts.append((gaussians, shown, moving_in_images(window), last))
+    rows = rows_of_windows(parts)
+    progress(count, count)
+    if not sum(len(part.order) for part in rows):
         raise ValueError("run: expected particles that can be seen, but got none; train it longer")
+    later = [
+        Later(gaussians, part, window.span, window.begin)
+        for window, (gaussians, *_), part in zip(source.later, parts[1:], rows[1:])
+    ]
+    cameras = [camera for window in windows for camera in window.cameras]
+    times = [film_time(window, time) for window in windows for time in window.image_times]
     numbers = sorted({0, *spread(len(cameras), _CAMERAS)})
     setting = Setting(
         [cameras[number] for number in numbers],
@@ -77,12 +92,63 @@ def packed_scene(
         focus_point(cameras),
         float(seconds),
         source.background,
-        [source.image_times[number] for number in numbers] if source.image_times else [],
+        [times[number] for number in numbers] if times else [],
     )
-    left_out = len(gaussians.means) - len(rows.order)
-    facts = {"particles": len(rows.order), "moving": rows.in_motion, "left out": left_out}
+    written = sum(len(part.order) for part in rows)
+    many = 0 if not later else int(shared[0][rows[0].order].sum())
+    left_out = sum(len(gaussians.means) for gaussians, *_ in parts) - written - many * len(later)
+    facts = {"particles": written, "moving": sum(part.in_motion for part in rows), "left out": left_out}
+    facts |= {"windows": len(windows), "shared": many} if later else {}
     facts |= {"quality": quality, "seconds": seconds, "colors": "sRGB, as in the images"}
-    return write(gaussians, setting, quality, rows), facts
+    options = {"span": source.span, "shared": many, "later": later}
+    return write(parts[0][0], setting, quality, rows[0], **options), facts
+
+
+def film_time(window: Source, time: float) -> float:
+    """Return the time of the film at a time of a window."""
+    first, last = window.span
+    return first + time * (last - first)
+
+
+def _told(progress: Progress, before: int, count: int, done: int, _: int) -> None:
+    progress(before + done, count)
+
+
+def shared_in(windows: Sequence[Source]) -> list[Tensor | None]:
+    """Return which particles (N,) of each window stand still in all of them, the same ones in the same order;
+    None of a single window.
+    """
+    ids = [window.method.common() if isinstance(window.method, HasCommon) else None for window in windows]
+    if len(windows) < 2:
+        return [None]
+    if any(part is None for part in ids):
+        return [torch.zeros(len(window.method.moving().means), dtype=torch.bool) for window in windows]
+    in_all = ids[0][ids[0] >= 0]
+    for part in ids[1:]:
+        in_all = in_all[torch.isin(in_all, part)]
+    return [torch.isin(part, in_all) for part in ids]
+
+
+def rows_of_windows(parts: Sequence[tuple]) -> list[Rows]:
+    """Choose the rows of each window that are written: of the first one with those that all share, at the
+    end; of the others without them.
+
+    Args:
+        parts: of each window its Gaussians, and which of them are shown, in motion, and shared.
+    """
+    if len(parts) == 1:
+        return [rows_in_file(*parts[0][:3])]
+    shares = [part[3] for part in parts]
+    if parts[0][1] is not None:  # what one window shows of those shared is written
+        shown = torch.stack([part[1][share] for part, share in zip(parts, shares)]).any(0)
+        for part, share in zip(parts, shares):
+            part[1][share] = shown
+    chosen = [rows_in_file(*part) for part in parts]
+    for number, share in enumerate(shares[1:], 1):
+        chosen[number] = chosen[number]._replace(
+            order=chosen[number].order[~share.numpy()[chosen[number].order]]
+        )
+    return chosen
 
 
 def moving_in_images(source: Source) -> Tensor | None:

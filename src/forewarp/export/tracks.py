@@ -41,7 +41,8 @@ def no_progress(done: int, total: int) -> None:
 class Source:
     """A fitted ``module``, named ``model`` in its config, the ``cameras`` it was trained with, ``times`` in
     [0, 1], the ``background`` (3,) in [0, 1] of its images, the scene's ``name``, and, if known,
-    ``image_times``, when each camera took its image.
+    ``image_times``, when each camera took its image. Of a film in windows it is the first one, whose time 0
+    and 1 are those of the film in ``span``; ``later`` are the others, each shown from its ``begin`` on.
     """
 
     module: DynamicSceneModule
@@ -51,6 +52,9 @@ class Source:
     background: tuple[float, float, float] = (1.0, 1.0, 1.0)
     name: str = "scene"
     image_times: Sequence[float] = ()
+    span: tuple[float, float] = (0.0, 1.0)
+    begin: float = 0.0
+    later: Sequence[Source] = ()
 
     @property
     def method(self) -> Method:

@@ -14,18 +14,20 @@ import torch
 
 from forewarp.fields.curves import KINDS, PADDING, Curve
 from forewarp.fields.moving import MARGIN, MovingGaussians, NodeMotion
+from forewarp.fields.windows import MovingWindows, Window, check_windows, joined, taken
 from forewarp.files import MOST_CONFIG, read_bytes
 from forewarp.glb import meshopt
 from forewarp.glb.container import CHUNKS, COMPONENTS, COMPRESSION, ELEMENTS, MAGIC, VERSION
-from forewarp.glb.writer import FORMAT, MOTION, SPLATS, Setting
+from forewarp.glb.writer import FORMAT, MOTION, SPLATS, WINDOWS, Setting
 from forewarp.ops.gaussians import LEAST_LOG
 from forewarp.scene.camera import Camera, Lens
 
 _KNOWN = {COMPRESSION, SPLATS, MOTION}  # extensions that a file may require
-FEATURES: frozenset[str] = frozenset()  # names that a file may list of what a reader must know
+FEATURES = frozenset({WINDOWS})  # names that a file may list of what a reader must know
 # At most: degree of the harmonics, cosines over time, accessors of links.
 _MOST = 1 << 28  # bytes of the file, and of all its arrays: some 200,000 particles of degree 3
 _DEGREES, _COSINES, _LINKS = 3, 64, 16
+_WINDOWS = 1000  # at most
 FARTHEST = 0.2  # of all time: no image's time is off by more
 _ONE_FILTER = {"NONE": None, "EXPONENTIAL": None, "QUATERNION": 8}  # the stride that a filter asks for
 
@@ -236,7 +238,7 @@ def _parsed(text: bytes) -> Any:
 class Contents:
     """What a file holds: ``gaussians``, in its order, and their ``setting``; its format's ``version``."""
 
-    gaussians: MovingGaussians
+    gaussians: MovingGaussians | MovingWindows
     setting: Setting
     version: str
 
@@ -270,6 +272,8 @@ def _scene(container: Container) -> Contents:
     if unknown := [name for name in motion.items("features", []) if name not in FEATURES]:
         raise ValueError(f"expected features known here, but got {_short(unknown[0])}; update forewarp")
     gaussians = _gaussians(container, primitive.part("attributes"), motion)
+    if WINDOWS in motion:
+        gaussians = _windows(container, gaussians, motion)
     setting = Setting(
         *_cameras(description, number),
         torch.tensor(motion.numbers("focus", 3, [0, 0, 0]), dtype=torch.float64),
@@ -279,19 +283,56 @@ def _scene(container: Container) -> Contents:
     return Contents(gaussians, setting, version)
 
 
+def _windows(container: Container, first: MovingGaussians, motion: Fields) -> MovingWindows:
+    """Read the windows of a film; the last rows of the first one are shown in all."""
+    about, description = motion.part(WINDOWS), container.description
+    parts, meshes = about.parts("list"), description.parts("meshes")
+    if not 2 <= len(parts) <= _WINDOWS:
+        raise ValueError(f"{about.place}.list: expected 2 to {_WINDOWS} windows, but got {len(parts)}")
+    still = torch.arange(len(first.means))[len(first.means) - about.whole("shared", 0, len(first.means), 0) :]
+    spans = [tuple(part.numbers("span", 2)) for part in parts]
+    begins = [part.number("from", 0, 1) for part in parts]
+    if not all(0 <= begin < end <= 1 for begin, end in spans):
+        raise ValueError(f"{about.place}.list: expected spans in [0, 1], but got {_short(spans)}")
+    fade = about.number("fade", 0, 0.5, 0)
+    check_windows(begins, spans, fade)
+    gaussians, shared = [first], taken(first, still)
+    for part in parts[1:]:
+        mesh = meshes[part.whole("mesh", 0, len(meshes) - 1)]
+        if (held := _held(mesh)) is None:
+            raise ValueError(f"{part.place}.mesh: expected Gaussians with {MOTION}, but got none")
+        primitive, splats = held
+        own = _gaussians(container, primitive.part("attributes"), splats.part("extensions").part(MOTION))
+        if _coefficients(own) != _coefficients(shared):
+            raise ValueError(f"{part.place}: expected as many coefficients as the first window has")
+        gaussians.append(joined(own, shared))
+    return MovingWindows(tuple(map(Window, gaussians, spans, begins)), fade)
+
+
+def _coefficients(gaussians: MovingGaussians) -> list[tuple | None]:
+    """Return the shapes of what is added to colour and opacity, without the number of Gaussians."""
+    parts = gaussians.harmonics, gaussians.color_over_time, gaussians.opacity_over_time
+    return [None if part is None else tuple(part.shape[1:]) for part in parts]
+
+
 def _primitive(description: Fields) -> tuple[int, Fields, Fields]:
     """Return the node that holds the moving Gaussians, their primitive, and its extension."""
     nodes, meshes = description.parts("nodes"), description.parts("meshes")
     for number, node in enumerate(nodes):
-        if "mesh" not in node:
-            continue
-        for primitive in meshes[node.whole("mesh", 0, len(meshes) - 1)].parts("primitives"):
-            extensions = primitive.content.get("extensions")
-            splats = extensions.get(SPLATS) if isinstance(extensions, dict) else None
-            inner = splats.get("extensions") if isinstance(splats, dict) else None
-            if isinstance(inner, dict) and MOTION in inner:
-                return number, primitive, Fields(splats, SPLATS)
+        if "mesh" in node and (held := _held(meshes[node.whole("mesh", 0, len(meshes) - 1)])) is not None:
+            return number, *held
     raise ValueError(f"expected Gaussians with {MOTION}, but got a glTF without them")
+
+
+def _held(mesh: Fields) -> tuple[Fields, Fields] | None:
+    """Return the primitive of a mesh that holds moving Gaussians, and its extension; None: there is none."""
+    for primitive in mesh.parts("primitives"):
+        extensions = primitive.content.get("extensions")
+        splats = extensions.get(SPLATS) if isinstance(extensions, dict) else None
+        inner = splats.get("extensions") if isinstance(splats, dict) else None
+        if isinstance(inner, dict) and MOTION in inner:
+            return primitive, Fields(splats, SPLATS)
+    return None
 
 
 def _gaussians(container: Container, attributes: Fields, motion: Fields) -> MovingGaussians:

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from forewarp.fields.curves import PADDING
 from forewarp.fields.moving import MARGIN, MovingGaussians, NodeMotion
+from forewarp.fields.windows import longest_fade
 from forewarp.glb import meshopt
 from forewarp.glb.container import (
     BYTE,
@@ -26,7 +27,8 @@ from forewarp.ops.gaussians import LEAST_LOG
 from forewarp.scene.camera import Camera
 
 SPLATS, MOTION = "KHR_gaussian_splatting", "FOREWARP_gaussian_motion"
-FORMAT = "1.0"
+FORMAT = "1.1"
+WINDOWS = "windows"  # a feature, and the property that describes it
 COMPACT, LOSSLESS = "compact", "lossless"
 _LEAST_NEAR = 1e-6  # of a camera's far plane: glTF's near plane lies in front of the camera
 _SLOTS = 4  # links in an accessor
@@ -49,7 +51,28 @@ class Setting:
     times: Sequence[float] = ()
 
 
-def write(gaussians: MovingGaussians, setting: Setting, quality: str, rows: Rows) -> bytes:
+@dataclass(frozen=True)
+class Later:
+    """A window of a film after the first one: ``rows`` (of ``rows_in_file``) of ``gaussians``, without those
+    that all windows share; see ``fields.windows.Window``.
+    """
+
+    gaussians: MovingGaussians
+    rows: Rows
+    span: tuple[float, float]
+    begin: float
+
+
+def write(
+    gaussians: MovingGaussians,
+    setting: Setting,
+    quality: str,
+    rows: Rows,
+    *,
+    span: tuple[float, float] = (0.0, 1.0),
+    shared: int = 0,
+    later: Sequence[Later] = (),
+) -> bytes:
     """Return the file.
 
     Args:
@@ -57,19 +80,21 @@ def write(gaussians: MovingGaussians, setting: Setting, quality: str, rows: Rows
         setting: what else is in the file.
         quality: ``compact``: rounded to what an eye can tell; ``lossless``: float32.
         rows: of ``rows_in_file``.
+        span: of a film in windows, that of the first one.
+        shared: how many of the last rows all windows show.
+        later: the other windows.
     """
-    order, moving, in_motion = rows
     store = _Store(compact=quality == COMPACT)
-    buffer, steps = store.buffer, _Steps.of(gaussians, setting)
-    attributes = _attributes(store, steps, gaussians, order)
-    motion = {"version": FORMAT, "features": [], "canonicalTime": gaussians.canonical_time}
-    motion |= _setting(setting, gaussians) | _over_time(store, steps, gaussians, order)
-    motion |= {"moving": moving, "inMotion": in_motion}
-    if moving:
-        motion |= _motion(store, steps, gaussians.motion, order[:moving])
-    splats = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display", "projection": "perspective"}
-    splats |= {"sortingMethod": "cameraDistance", "extensions": {MOTION: motion}}
-    primitive = {"mode": 0, "attributes": attributes, "extensions": {SPLATS: splats}}
+    buffer = store.buffer
+    primitives = [_primitive(store, setting, part, order) for part, order in _parts(gaussians, rows, later)]
+    motion = primitives[0]["extensions"][SPLATS]["extensions"][MOTION]
+    motion |= _setting(setting)
+    if later:
+        motion["features"] = [WINDOWS]
+        windows = [{"span": list(span), "from": 0.0}]
+        windows += [{"mesh": n, "span": list(w.span), "from": w.begin} for n, w in enumerate(later, 1)]
+        fade = longest_fade([w["from"] for w in windows], [w["span"] for w in windows])
+        motion[WINDOWS] = {"shared": shared, "fade": fade, "list": windows}
     cameras = [_camera(camera) for camera in setting.cameras]
     for camera, time in zip(cameras, setting.times):
         camera["extras"]["time"] = time
@@ -90,9 +115,30 @@ def write(gaussians: MovingGaussians, setting: Setting, quality: str, rows: Rows
         "scenes": [{"nodes": [0]}],
         "nodes": nodes,
         "cameras": cameras,
-        "meshes": [{"primitives": [primitive]}],
+        "meshes": [{"primitives": [primitive]} for primitive in primitives],
     }
     return buffer.packed(description)
+
+
+def _parts(
+    gaussians: MovingGaussians, rows: Rows, later: Sequence[Later]
+) -> list[tuple[MovingGaussians, Rows]]:
+    return [(gaussians, rows), *((window.gaussians, window.rows) for window in later)]
+
+
+def _primitive(store: _Store, setting: Setting, gaussians: MovingGaussians, rows: Rows) -> dict:
+    """Store Gaussians and their motion as a primitive of points."""
+    order, moving, in_motion = rows
+    steps = _Steps.of(gaussians, setting)
+    attributes = _attributes(store, steps, gaussians, order)
+    motion = {"version": FORMAT, "features": [], "canonicalTime": gaussians.canonical_time}
+    motion |= {"blur": gaussians.blur} | _over_time(store, steps, gaussians, order)
+    motion |= {"moving": moving, "inMotion": in_motion}
+    if moving:
+        motion |= _motion(store, steps, gaussians.motion, order[:moving])
+    splats = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display", "projection": "perspective"}
+    splats |= {"sortingMethod": "cameraDistance", "extensions": {MOTION: motion}}
+    return {"mode": 0, "attributes": attributes, "extensions": {SPLATS: splats}}
 
 
 def _quaternion(rotation: Tensor) -> list[float]:
@@ -118,12 +164,11 @@ def _camera(camera: Camera) -> dict:
     return {"type": "perspective", "perspective": perspective, "extras": extras}
 
 
-def _setting(setting: Setting, gaussians: MovingGaussians) -> dict:
+def _setting(setting: Setting) -> dict:
     return {
         "seconds": setting.seconds,
         "background": list(setting.background),
         "focus": setting.focus.tolist(),
-        "blur": gaussians.blur,
         "cutoff": math.exp(LEAST_LOG),
         "margin": MARGIN,
     }
@@ -140,7 +185,10 @@ class Rows(NamedTuple):
 
 
 def rows_in_file(
-    gaussians: MovingGaussians, shown: Tensor | None = None, in_motion: Tensor | None = None
+    gaussians: MovingGaussians,
+    shown: Tensor | None = None,
+    in_motion: Tensor | None = None,
+    last: Tensor | None = None,
 ) -> Rows:
     """Choose the rows that are written; those near each other come near each other.
 
@@ -148,6 +196,7 @@ def rows_in_file(
         gaussians: those that are never more opaque than the cutoff are left out,
         shown: (N,) bool, as are those that are not shown; None: all are.
         in_motion: (N,) bool, which are seen to move; None: all that follow nodes.
+        last: (N,) bool, which come after all others, and follow no nodes; None: none.
     """
     logits = gaussians.opacity
     if gaussians.opacity_over_time is not None:
@@ -159,7 +208,8 @@ def rows_in_file(
     if gaussians.motion is not None:
         rests = ~(gaussians.motion.weights > 0).any(-1).numpy()
     still = rests if in_motion is None else rests | ~in_motion.numpy()
-    order = np.lexsort((morton(gaussians.means.numpy()), still, rests))
+    ends = np.zeros(len(seen), bool) if last is None else last.numpy()
+    order = np.lexsort((morton(gaussians.means.numpy()), still, rests, ends))
     order = order[seen[order]]
     return Rows(order, int((~rests[order]).sum()), int((~still[order]).sum()))
 

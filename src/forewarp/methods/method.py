@@ -348,6 +348,16 @@ class HasLayers(Protocol):
 
 
 @runtime_checkable
+class HasCommon(Protocol):
+    """Be Gaussians some of which other runs have too, as they began from the same one (``Start.shares``)."""
+
+    def common(self) -> Tensor | None:
+        """Return, for each row of ``HasMovingGaussians``, the row of that run (N,) int64 which it still is;
+        -1: of none; ascending but for these. None: the run began from no other.
+        """
+
+
+@runtime_checkable
 class HasShares(Protocol):
     """Of a snapshot of ``HasLayers``: tell how much of a view some rows are."""
 

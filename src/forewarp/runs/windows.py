@@ -10,6 +10,7 @@ from forewarp.files import read_json
 from forewarp.runs.overrides import is_sweep, key_of, text_override
 
 _MOST = 1000
+_SEAM = 1e-4  # of a film, by which a window may begin beside the end of the one before
 _SHOWS = ("--cfg", "-c", "--info", "-i", "--hydra-help", "--shell-completion", "-sc")  # no run
 _SHOWN = ("psnr", "ssim", "ms_ssim", "lpips_vgg", "lpips_alex", "lpips_squeeze")  # of the metrics, if there
 
@@ -87,3 +88,19 @@ def scores_of(folders: Iterable[str | Path]) -> list[str]:
         means = "  ".join(f"{name} {fmean(score[name] for score in scores):.4f}" for name in names)
         lines.append(f"  {label:<{width}}  {len(scores):>4} views  {means}")
     return lines
+
+
+def check_film(windows: Sequence[tuple[float, float]], folder: Path) -> None:
+    """Refuse windows, in their order, that do not make up a whole film.
+
+    Raises:
+        ValueError: naming them.
+    """
+    ends = [0.0, *(end for _, end in windows)]
+    follow = all(abs(begin - end) < _SEAM for (begin, _), end in zip(windows, ends))
+    if not windows or not follow or abs(ends[-1] - 1) > _SEAM:
+        got = ", ".join(f"[{begin:g}, {end:g}]" for begin, end in windows) or "none"
+        raise ValueError(
+            f"{folder}: expected a run, or windows that follow one another from 0 to 1, but got {got}; train "
+            "those that are missing (windows=N), move others elsewhere"
+        )

@@ -411,8 +411,9 @@ class Renderer {
     this.target = { width, height, texture, framebuffer: this.framebuffer([texture]) };
   }
 
-  // Take node maps and the time's part of colours; then particles are where they are at that time.
-  setTime(time) {
+  // Take node maps and the time's part of colours; then particles are where they are at that time of the film.
+  setTime(filmTime) {
+    const [first, last] = this.scene.span, time = Math.min(Math.max((filmTime - first) / (last - first), 0), 1);
     this.time = time;
     this.basis = timeBasis(this.scene, time, this.times);
     if (!this.scene.nodes) return;
@@ -485,8 +486,9 @@ class Renderer {
     gl.disable(gl.BLEND);
   }
 
-  // Draw the target, and trails where there are any, onto the canvas, which has its size.
-  drawCanvas(view, background, trailWidth = 0) {
+  // Draw the target, and trails where there are any, onto the canvas, which has its size; by a share of less
+  // than 1 over what is there.
+  drawCanvas(view, background, trailWidth = 0, share = 1) {
     const { gl, over } = this;
     gl.bindFramebuffer(gl.FRAMEBUFFER, null);
     gl.viewport(0, 0, ...view.size);
@@ -494,7 +496,11 @@ class Renderer {
     this.bind(over, "target", 0, this.target.texture);
     gl.uniform3fv(over.place("background"), background);
     gl.uniform1i(over.place("height"), view.size[1]);
+    if (share < 1) gl.enable(gl.BLEND);
+    gl.blendColor(0, 0, 0, share);
+    gl.blendFunc(gl.CONSTANT_ALPHA, gl.ONE_MINUS_CONSTANT_ALPHA);
     gl.drawArrays(gl.TRIANGLES, 0, 3);
+    gl.disable(gl.BLEND);
     if (trailWidth && this.segments) this.drawTrails(view, trailWidth);
   }
 

@@ -1,6 +1,6 @@
 // Read scene.glb (docs/format.md): a glTF 2.0 binary of Gaussians, with the motion beside them.
 
-const KNOWN_FEATURES = [];
+const KNOWN_FEATURES = ["windows"];
 const COMPONENTS = {
   5120: [Int8Array, 127], 5121: [Uint8Array, 255], 5122: [Int16Array, 32767],
   5123: [Uint16Array, 65535], 5125: [Uint32Array, 1], 5126: [Float32Array, 1],
@@ -160,18 +160,13 @@ function camerasOf(gltf, matrices, turn) {
   });
 }
 
-// Read a scene: arrays of numbers, one row a particle; those that move come first.
-function readScene(bytes) {
-  const [gltf, binary] = chunksOf(bytes), read = accessorsOf(gltf, binary);
-  const mesh = gltf.nodes.findIndex((node) => node.mesh !== undefined);
-  const primitive = gltf.meshes?.[gltf.nodes[mesh]?.mesh]?.primitives[0], splats = primitive?.extensions?.[SPLATS];
-  const motion = splats?.extensions?.[MOTION];
+// Return what a primitive has of our extension; nothing of others.
+const motionOf = (primitive) => primitive?.extensions?.[SPLATS]?.extensions?.[MOTION];
+
+// Read the particles of a primitive: arrays of numbers, one row a particle; those that move come first.
+function readParticles(primitive, gltf, read) {
+  const motion = motionOf(primitive), named = primitive.attributes, harmonics = [];
   if (!motion) throw new Error(`expected ${SPLATS} with ${MOTION}`);
-  if (!/^1\./.test(motion.version)) throw new Error(`expected ${MOTION} 1, but got ${motion.version}`);
-  const foreign = (motion.features ?? []).filter((name) => !KNOWN_FEATURES.includes(name));
-  if (foreign.length) throw new Error(`this page does not know ${foreign.join(", ")}`);
-  const matrices = globalMatrices(gltf.nodes), turn = matrices[mesh], named = primitive.attributes;
-  const harmonics = [];
   for (let degree = 0; `${SPLATS}:SH_DEGREE_${degree}_COEF_0` in named; degree++) {
     for (let n = 0; n <= 2 * degree; n++) harmonics.push(read(named[`${SPLATS}:SH_DEGREE_${degree}_COEF_${n}`]));
   }
@@ -194,8 +189,46 @@ function readScene(bytes) {
     },
     timeOffsets: timeOffsets && { times: read(timeOffsets.times), offsets: read(timeOffsets.offsets) },
     colorOverTime: (motion.colorOverTime ?? []).map(read), opacityOverTime: (motion.opacityOverTime ?? []).map(read),
-    canonicalTime: motion.canonicalTime, seconds: motion.seconds ?? 4, background: motion.background ?? [1, 1, 1],
-    focus: motion.focus ?? [0, 0, 0], margin: motion.margin ?? 0.125, blur: motion.blur,
+    canonicalTime: motion.canonicalTime, blur: motion.blur,
+  };
+}
+
+// Return particles, and after them the last ones of others, which rest.
+function joined(own, others, many) {
+  const joinRows = (a, b) => {
+    if (a === null) return null;
+    const out = new Float32Array(a.length + (b.length / others.count) * many);
+    out.set(a);
+    out.set(b.subarray(b.length - (out.length - a.length)), a.length);
+    return out;
+  };
+  const rows = {}, lists = {};
+  for (const name of ["places", "quaternions", "scales", "opacity", "logits"]) rows[name] = joinRows(own[name], others[name]);
+  for (const name of ["harmonics", "colorOverTime", "opacityOverTime"]) {
+    if (own[name].length !== others[name].length) throw new Error("windows of other coefficients");
+    lists[name] = own[name].map((values, k) => joinRows(values, others[name][k]));
+  }
+  return { ...own, ...rows, ...lists, count: own.count + many };
+}
+
+// Read a scene: the windows of a film, in their order; of all others one.
+function readScene(bytes) {
+  const [gltf, binary] = chunksOf(bytes), read = accessorsOf(gltf, binary);
+  const mesh = gltf.nodes.findIndex((node) => node.mesh !== undefined);
+  const primitive = gltf.meshes?.[gltf.nodes[mesh]?.mesh]?.primitives[0], motion = motionOf(primitive);
+  if (!motion) throw new Error(`expected ${SPLATS} with ${MOTION}`);
+  if (!/^1\./.test(motion.version)) throw new Error(`expected ${MOTION} 1, but got ${motion.version}`);
+  const foreign = (motion.features ?? []).filter((name) => !KNOWN_FEATURES.includes(name));
+  if (foreign.length) throw new Error(`this page does not know ${foreign.join(", ")}`);
+  const matrices = globalMatrices(gltf.nodes), turn = matrices[mesh];
+  const setting = {
+    seconds: motion.seconds ?? 4, background: motion.background ?? [1, 1, 1],
+    focus: motion.focus ?? [0, 0, 0], margin: motion.margin ?? 0.125,
     up: [turn[1], turn[5], turn[9]], cameras: camerasOf(gltf, matrices, turn),
   };
+  const first = readParticles(primitive, gltf, read), { shared = 0, fade = 0, list = [{}] } = motion.windows ?? {};
+  return list.map(({ mesh: number, span = [0, 1], from = 0 }) => {
+    const own = number === undefined ? first : readParticles(gltf.meshes[number].primitives[0], gltf, read);
+    return { ...setting, ...(own === first ? own : joined(own, first, shared)), span, from, fade };
+  });
 }

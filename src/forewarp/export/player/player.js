@@ -100,8 +100,7 @@ function poseOn(path, time) {
 }
 
 class Player {
-  constructor(scene) {
-    this.scene = scene;
+  constructor(scenes) {
     this.canvas = byId("canvas");
     this.time = 0;
     this.speed = 1;
@@ -114,14 +113,43 @@ class Player {
     this.pace = 16; // milliseconds between frames, smoothed
     this.changed = this.touched = this.last = 0;
     this.waiting = [];
-    this.renderer = new Renderer(this.canvas, scene);
-    this.sorting = new Sorting(scene, (order) => {
-      this.renderer.setOrder(order);
-      this.stale = true;
-      this.wake();
+    this.windows = scenes.map((scene) => {
+      const part = { scene, renderer: new Renderer(this.canvas, scene) };
+      part.sorting = new Sorting(scene, (order) => {
+        part.renderer.setOrder(order);
+        this.stale = true;
+        this.wake();
+      });
+      return part;
     });
-    this.path = pathOf(scene);
+    Object.assign(this, this.windows[0]);
+    this.shown = [[this.windows[0], 1]];
+    this.path = pathOf(this.scene);
     this.home();
+  }
+
+  // Return the windows of the film that are shown at a time, the one that it is of first, and their shares.
+  shownAt(time) {
+    const after = this.windows.findIndex(({ scene }) => scene.from > time);
+    const number = (after < 0 ? this.windows.length : Math.max(after, 1)) - 1, part = this.windows[number];
+    const { from, fade } = part.scene, next = this.windows[number + 1];
+    if (number && time - from < fade) return [[part, 0.5 + (time - from) / (2 * fade)], [this.windows[number - 1]]];
+    if (next && time > next.scene.from - fade) return [[part, 0.5 + (next.scene.from - time) / (2 * fade)], [next]];
+    return [[part, 1]];
+  }
+
+  // Show the windows of the time, each in the right order at once.
+  enter() {
+    const shown = this.shownAt(this.time);
+    for (const [part] of shown) {
+      if (this.shown.some(([known]) => known === part)) continue;
+      part.renderer.setTime(this.time);
+      part.renderer.setOrder(new Sorter(part.scene).sorted(part.renderer.maps, this.eye));
+    }
+    const [[part]] = this.shown = shown;
+    if (part.scene === this.scene) return;
+    Object.assign(this, part);
+    if (this.trails) this.setTrails(true);
   }
 
   // Look through the first camera, or along with the one that moved through the scene.
@@ -162,6 +190,7 @@ class Player {
 
   setTime(time) {
     this.time = clamp(time, 0, 1);
+    this.enter();
     if (this.riding) this.stand(poseOn(this.path, this.time));
     this.untimed = this.stale = this.unsorted = true;
     this.changed = performance.now();
@@ -225,6 +254,10 @@ class Player {
     return this.setTime(time - Math.floor(time));
   }
 
+  moves() {
+    return this.windows.some(({ scene }) => scene.moving > 0);
+  }
+
   background() {
     return BEHIND[this.behind] ?? this.scene.background;
   }
@@ -255,10 +288,10 @@ class Player {
     if (this.playing && quiet) document.body.classList.add("idle");
     this.adapt(lively);
     if (this.untimed) {
-      this.renderer.setTime(this.time);
+      for (const [{ renderer }] of this.shown) renderer.setTime(this.time);
       this.showTime();
     }
-    if (this.unsorted) this.sorting.ask(this.renderer.maps, this.eye);
+    if (this.unsorted) for (const [{ renderer, sorting }] of this.shown) sorting.ask(renderer.maps, this.eye);
     const { stale } = this;
     this.untimed = this.unsorted = this.stale = false;
     if (stale) this.paint(lively);
@@ -285,8 +318,10 @@ class Player {
       this.canvas.height = height;
     }
     const view = this.view(width, height), trail = this.trails ? Math.max((1.6 * width) / this.canvas.clientWidth, 1) : 0;
-    this.renderer.drawTarget(view, this.layer);
-    this.renderer.drawCanvas(view, this.background(), trail);
+    const [[part, share], [other] = []] = this.shown;
+    for (const { renderer } of other ? [other, part] : [part]) renderer.drawTarget(view, this.layer);
+    if (other) other.renderer.drawCanvas(view, this.background());
+    part.renderer.drawCanvas(view, this.background(), trail, share);
     if (scale !== 1) this.stale = true; // once more, sharply, when nothing moves any more
   }
 
@@ -338,7 +373,7 @@ class Player {
     if (asked.get("trails") === "1") this.setTrails(true);
     document.body.classList.toggle("bare", asked.get("controls") === "0");
     const wanted = asked.has("autoplay") ? asked.get("autoplay") === "1" : !Number.isFinite(time);
-    this.play(wanted && !reduced && this.scene.moving > 0);
+    this.play(wanted && !reduced && this.moves());
   }
 
   // Resolve once what the page shows is sharp and in the right order; while it plays, at once.
@@ -377,7 +412,7 @@ function connect(player) {
   for (const row of document.querySelectorAll("[data-of]")) row.hidden = byId(row.dataset.of).hidden;
   byId("camera").hidden = player.scene.cameras.length < 2;
   byId("layers").hidden = !player.scene.inMotion || player.scene.inMotion === player.scene.count;
-  for (const name of ["play", "time", "clock", "trails"]) byId(name).disabled = !player.scene.moving;
+  for (const name of ["play", "time", "clock", "trails"]) byId(name).disabled = !player.moves();
   click("play", () => player.play(!player.playing));
   click("home", home);
   click("whole", toggleWhole);
@@ -404,8 +439,9 @@ function connect(player) {
     "[": () => speedUp(-1), "]": () => speedUp(1), escape: () => togglePanel(false),
   };
   function step(sign) {
+    const { span: [first, last], curve } = player.scene;
     player.play(false);
-    player.setTime(player.time + sign / (player.scene.curve?.frames > 1 ? player.scene.curve.frames - 1 : 50));
+    player.setTime(player.time + (sign * (last - first)) / (curve?.frames > 1 ? curve.frames - 1 : 50));
   }
   function speedUp(by) {
     const inputs = [...document.getElementsByName("speed")], at = inputs.findIndex((input) => input.checked);
@@ -487,7 +523,8 @@ function connect(player) {
     tell("The graphics card was taken away; the scene comes back with it.");
   });
   canvas.addEventListener("webglcontextrestored", () => {
-    player.renderer = new Renderer(canvas, player.scene);
+    for (const part of player.windows) part.renderer = new Renderer(canvas, part.scene);
+    Object.assign(player, player.shown[0][0]);
     player.lost = false;
     if (player.trails) player.setTrails(true);
     player.setTime(player.time);
@@ -504,13 +541,16 @@ function tell(text) {
 // What scripts of other pages, and our tests, may ask.
 function doorOf(player) {
   const reached = ({ width, height, time = player.time, camera = player.camera, layer = player.layer }) => {
-    const { renderer, scene } = player;
-    renderer.setTime(time);
-    const { lens, ...pose } = scene.cameras[camera], view = { ...pose, ...fitted(lens, width, height) };
-    renderer.setOrder(new Sorter(scene).sorted(renderer.maps, view.eye));
-    renderer.drawTarget(view, layer);
-    player.setTime(player.time); // what is on the page comes back
-    return renderer.readTarget();
+    const { lens, ...pose } = player.scene.cameras[camera], view = { ...pose, ...fitted(lens, width, height) };
+    const [first, second] = player.shownAt(time).map(([{ renderer, scene }, share]) => {
+      renderer.setTime(time);
+      renderer.setOrder(new Sorter(scene).sorted(renderer.maps, view.eye));
+      renderer.drawTarget(view, layer);
+      return { pixels: renderer.readTarget(), share };
+    });
+    player.shown = []; // what is on the page comes back
+    player.setTime(player.time);
+    return first.pixels.map((value, i) => (second ? first.share * value + (1 - first.share) * second.pixels[i] : value));
   };
   return {
     scene: player.scene, player, settled: () => player.settled(),
@@ -565,13 +605,13 @@ async function main() {
     if (!window.DecompressionStream) {
       return giveUp("This browser is too old to unpack the scene: this is a picture of it.");
     }
-    const scene = readScene(await unpacked(byId("scene").textContent));
+    const scenes = readScene(await unpacked(byId("scene").textContent));
     byId("scene").remove();
     byId("canvas").hidden = false;
-    const player = new Player(scene);
+    const player = new Player(scenes);
     connect(player);
     player.renderer.setTime(0);
-    player.renderer.setOrder(new Sorter(scene).sorted(player.renderer.maps, player.eye));
+    player.renderer.setOrder(new Sorter(player.scene).sorted(player.renderer.maps, player.eye));
     player.follow(quiet.matches);
     addEventListener("hashchange", () => player.follow(quiet.matches));
     quiet.addEventListener("change", () => quiet.matches && player.play(false));

@@ -74,7 +74,7 @@ class Particles(Method):
     # Scene queries: see ``methods.method``.
     matter, bounds, trajectories = queries.matter, queries.bounds, queries.trajectories
     ellipsoids, template, movement = queries.ellipsoids, queries.template, queries.movement
-    moving, in_motion, only = queries.moving, queries.in_motion, queries.only
+    moving, in_motion, only, common = queries.moving, queries.in_motion, queries.only, queries.common
     carried = queries.carried
 
     def __init__(

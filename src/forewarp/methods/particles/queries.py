@@ -82,6 +82,11 @@ def in_motion(self: Particles, frames: Sequence[Frame]) -> Tensor:
     return (ranges[beside].median(-1).values > MOVES) & (self.skinning.shares.sum(-1) > 0)
 
 
+def common(self: Particles) -> Tensor | None:
+    """See ``HasCommon``."""
+    return None if self.shared is None else self.shared.cpu()
+
+
 def _in_image(camera: Camera, points: Tensor) -> Tensor:
     """Return which points (N, 3) lie before a camera and within its image."""
     pixels, depth = camera.project(points)
