@@ -21,9 +21,11 @@ from forewarp.cli.capture import check
 from forewarp.data.posed_video import PosedShot, read_scene, write_scene
 from forewarp.scene.box import Box
 from forewarp.synth.raycast import render
+from forewarp.synth.recordings import synthesize_multicam
 from forewarp.synth.scenes import random_cameras
 from forewarp.synth.walks import cameras_of
 from forewarp.synth.world import World
+from tests.bench.rigs import compared
 from tests.support.captures import WALKS, cameras_on_arc, pictures_of, pose_errors, write_model
 from tests.support.configs import CONF
 from tests.support.films import numbered, write_film
@@ -283,6 +285,46 @@ def test_a_video_becomes_a_scene_that_is_trained_also_when_interrupted(ok, in_tm
     budget = ["budget.minutes=null", "budget.iterations=40", "threads=1"]
     ok("train", "experiment=video_with_poses", *words, *budget)
     assert json.loads((in_tmp / "run" / "metrics.json").read_text())["test"]["all"]["psnr"] > 12
+
+
+@pytest.mark.slow
+def test_a_rig_of_videos_becomes_a_scene_that_is_trained(ok, refused, in_tmp):
+    """Cameras begin apart at two rates; one that films another place is named and left out, and what was
+    found of the others stays.
+    """
+    synthesize_multicam(in_tmp / "rig", cameras=4, frames=24, size=320, samples_per_pixel=1, workers=1)
+    noise = np.random.default_rng(0).integers(0, 256, (1, 60, 80, 3)).repeat(24, 0).repeat(4, 1).repeat(4, 2)
+    sound = ["-i", str(in_tmp / "rig" / "cam00.mp4"), "-map", "0:v", "-map", "1:a"]
+    write_film(in_tmp / "rig" / "wall (1).mp4", noise.astype(np.uint8), inputs=sound)
+    words = ["videos=rig", "out=captures/rig", "threads=1"]
+    said = refused("capture", *words)
+    assert "wall (1): expected a camera that sees what the others see, but got" in said
+    assert (
+        "leave it out (without=['wall (1)']), or go on without it (force=true); what was found stays" in said
+    )
+    done = ok("capture", *words, "without=['wall (1)']")
+    lines = done.out.splitlines()
+    assert lines[0] == "offsets: by sound"
+    assert "left out: wall (1)" in lines
+    assert lines[-1].endswith("data.root=captures data.scene=rig 'data.test_cameras=[cam00]'")
+    facts, _ = compared(in_tmp / "rig", in_tmp / "captures" / "rig")
+    assert facts["cameras"] == "4 of 4"
+    assert facts["offset_ms"] < 2
+    assert facts["degrees"][1] < 0.5
+    assert facts["size_percent"][1] < 5  # of some hundred points; of images twice as wide 0.2
+    about = json.loads((in_tmp / "captures" / "rig" / "capture.json").read_text())
+    cameras = about["cameras"].values()
+    assert all(camera["fixed"] and camera["certainty"] > 3 for camera in cameras)
+    assert [round(camera["rate"], 2) for camera in cameras] == [29.97, 30.0, 29.97, 30.0]
+    assert 0.002 < about["moving"] < 0.2
+    scene = read_scene("captures", "rig", test_cameras=["cam00"], test_moments=[5])
+    assert {frame.ability for frame in scene.test} == {"space", "time", "space_time"}
+    assert len({frame.time for frame in scene.train}) == len(scene.train)  # times of their own
+    rest = ["data.test_cameras=[cam00]", "data.scale=2", "trainer=cpu", "logger=none", "run=run", "threads=1"]
+    budget = ["budget.minutes=null", "budget.iterations=60"]
+    ok("train", "experiment=video_with_poses", "data.root=captures", "data.scene=rig", *rest, *budget)
+    scores = json.loads((in_tmp / "run" / "metrics.json").read_text())["test"]
+    assert scores["space"]["psnr"] > 10
 
 
 @pytest.mark.slow

@@ -1,5 +1,8 @@
 """Videos: the times of their frames, and frames from the middle."""
 
+import subprocess
+
+import imageio_ffmpeg
 import numpy as np
 import pytest
 
@@ -22,3 +25,25 @@ def test_what_is_no_video_has_no_frames(tmp_path):
     (tmp_path / "a.mp4").write_bytes(b"text")
     assert stamps_of(tmp_path / "a.mp4").shape == (0,)
     assert list(extracted(tmp_path / "a.mp4", None, None)) == []
+
+
+def test_frames_that_were_cut_off_without_coding_anew_have_no_time(tmp_path):
+    """They lie before the first frame that is shown, on which it depends."""
+    film, cut = write_film(tmp_path / "a.mp4", numbered(12)), tmp_path / "cut.mp4"
+    call = [
+        imageio_ffmpeg.get_ffmpeg_exe(),
+        "-v",
+        "error",
+        "-ss",
+        "0.2",
+        "-i",
+        str(film),
+        "-c",
+        "copy",
+        str(cut),
+    ]
+    subprocess.run(call, check=True)
+    np.testing.assert_allclose(stamps_of(cut), 0.04 * np.arange(7), atol=1e-6)
+    shown = list(extracted(cut, None, None))
+    assert len(shown) == 7
+    np.testing.assert_array_equal(shown[0], list(extracted(film, [5], None))[0])

@@ -8,11 +8,13 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import re
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
+from urllib.parse import quote
 
 import cv2
 import numpy as np
@@ -161,10 +163,16 @@ def _recording(name: str, path: Path, rate: float | None) -> Recording:
     if len(stamps) < 2:
         kind = "pictures" if images else "frames"
         got = f"{len(stamps)} {kind}" if len(stamps) else "another file"
-        raise ValueError(f"{path}: expected many {kind}, but got {got}; leave it out (without=[{name}])")
+        raise ValueError(f"{path}: expected many {kind}, but got {got}; leave it out ({_without(name)})")
     if not np.all(np.diff(stamps) > 0):
         raise ValueError(f"{path}: expected frames at different times, but got two at one; convert the video")
     return Recording(name, path, stamps, images)
+
+
+def _without(*names: str) -> str:
+    """Write what leaves cameras out."""
+    plain = [name if re.fullmatch(r"[\w.-]+", name) else repr(name) for name in names]
+    return f"without=[{','.join(plain)}]"
 
 
 def _refuse_unknown(key: str, names: Sequence[str], there: Sequence[str]) -> None:
@@ -244,7 +252,7 @@ def _heard_offsets(films: Sequence[Recording], is_asked: bool, step: Step):
             others = f" and {len(silent) - 1} more" if len(silent) > 1 else ""
             raise ValueError(
                 f"offsets: expected sound in all videos, but got none in {silent[0]}{others}; set offsets= "
-                f"in seconds, offsets=none if all began together, or without=[{','.join(silent)}]"
+                f"in seconds, offsets=none if all began together, or {_without(*silent)}"
             )
         half = len(films), 2 * len(films)
         heard = synchronise(sounds, lambda done, total: progress(half[0] + half[0] * done // total, half[1]))
@@ -255,7 +263,7 @@ def _heard_offsets(films: Sequence[Recording], is_asked: bool, step: Step):
         got = f"{heard.agreeing[row]} of {len(films) - 1} pairs that agree in {which}, with a certainty of "
         got += f"{heard.certainty[row]:.1f}"
         advice = "set offsets= in seconds"
-        advice += f", or without=[{','.join(unsure)}]" if len(unsure) < len(films) - 1 else ""
+        advice += f", or {_without(*unsure)}" if len(unsure) < len(films) - 1 else ""
         raise ValueError(f"offsets: expected sounds that all cameras share, a clap, but got {got}; {advice}")
     return heard.offsets, heard, "by sound"
 
@@ -283,7 +291,7 @@ def span_of(films: Sequence[Recording], offsets: np.ndarray) -> tuple[float, flo
         got += f" and {films[last].name} from {starts[last]:.2f} s on"
         raise ValueError(
             f"videos: expected films that overlap in time, but got {got}; set offsets=, or leave one out, "
-            f"without=[{films[last].name}]"
+            f"{_without(films[last].name)}"
         )
     missing = [f.name for f, a, b in zip(films, starts, ends) if a > best[0] or b < best[1]]
     return *best, f"{', '.join(missing)} film only a part of the time that the others share"
@@ -409,6 +417,9 @@ def capture_rig(
     Raises:
         ValueError: where nothing good comes of it, naming the camera.
     """
+    without = [str(name) for name in without]  # a name of digits is read as a number
+    if isinstance(offsets, Mapping):
+        offsets = {str(name): seconds for name, seconds in offsets.items()}
     everyone = [film.name for film in recordings(folder, rate)]
     films = recordings(folder, rate, without)
     about = {"videos": folder, "masks": masks, "fixed": fixed, "rate": rate, "frames": frames, "size": size}
@@ -481,7 +492,7 @@ def _suspects(cameras: Mapping[str, dict]) -> list[str]:
     usual = float(np.median(list(errors.values())))
     return [
         f"{name}: expected a reprojection error as of the others, {usual:.2f} pixels, but got {error:.2f}; "
-        f"if it was moved while filming, leave it out: without=[{name}]"
+        f"if it was moved while filming, leave it out: {_without(name)}"
         for name, error in errors.items()
         if error > max(1.0, _WORSE * usual)
     ]
@@ -550,11 +561,12 @@ def _look(
 def _look_at(work: _Work, film: Recording, rows: Sequence[int], fixed: bool | None) -> dict:
     """Write one camera's images: the still of a fixed one, all frames of another."""
     looks, dark = work.folder / "looks", work.folder / "looks_masks"
+    place = quote(film.name, safe="")  # pycolmap's list of pairs has no place for a space
     few = sorted({rows[i] for i in np.linspace(0, len(rows) - 1, _INSTANTS).round().astype(int)})
     images = list(film.pixels(few, work.size, work.threads))
     size = images[0].shape[1::-1]
     if not (is_fixed(images) if fixed is None else fixed):
-        names = [f"{film.name}/{film.frame(row)}" for row in rows]
+        names = [f"{place}/{row + 1:06d}.jpg" for row in rows]
         work.take(film, rows, None, None)
         for row, name in zip(rows, names):
             (looks / name).parent.mkdir(parents=True, exist_ok=True)
@@ -563,9 +575,9 @@ def _look_at(work: _Work, film: Recording, rows: Sequence[int], fixed: bool | No
             moves = read_image(given)[..., 0].numpy() == 0 if work.masks else np.zeros(size[::-1], bool)
             _write_mask(dark / f"{name}.png", moves)
         return {"fixed": False, "names": names}
-    name = f"{film.name}/still_{few[0]}_{few[-1]}_{len(few)}.png"
+    name = f"{place}/still_{few[0]}_{few[-1]}_{len(few)}.png"
     still = Still.of(images)
-    write_image(looks / name, np.median(images, axis=0).round().astype(np.uint8))
+    write_image(looks / name, np.sort(images, axis=0)[len(images) // 2])
     polluted = np.mean([still.moves(image) for image in images], axis=0) >= _POLLUTED
     moves = cv2.resize(polluted.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
     if work.masks is not None:
@@ -659,7 +671,7 @@ def _lost(films, looks: Looks, found: Reconstruction, matches: Mapping, force: b
         more = f" (and {', '.join(lost[1:])})" if lost[1:] else ""
         raise ValueError(
             f"{lost[0]}: expected a camera that sees what the others see, but got {count} matches{few}"
-            f"{more}; leave it out (without=[{','.join(lost)}]), or go on without it (force=true)"
+            f"{more}; leave it out ({_without(*lost)}), or go on without it (force=true)"
         )
     return lost
 

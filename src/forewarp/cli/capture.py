@@ -86,7 +86,8 @@ def capture(config) -> None:
         options |= OmegaConf.to_container(OmegaConf.masked_copy(config, list(RIG)))
         facts = rig.capture_rig(videos, out, search, Counted, masks=source["masks"], **options)
         lines, posed = rig.summary(facts), [name for name in facts["cameras"] if name not in facts["lost"]]
-        held = [f"data.test_cameras=[{posed[0]}]"] if len(posed) >= LEAST_HELD else []
+        first = text_override("data.test_cameras", posed[0]).partition("=")[2]
+        held = [f"data.test_cameras=[{first}]"] if len(posed) >= LEAST_HELD else []
     tell(lines, out, held)
 
 

@@ -117,13 +117,16 @@ def _header(video: Path, size: int, changed: int) -> str:
 
 
 def stamps_of(video: Path) -> np.ndarray:
-    """Read the times of a video's frames, seconds, ascending, decoding none; empty where it is no video."""
+    """Read the times of a video's frames, seconds, ascending, decoding none; empty where it is no video.
+
+    Those before 0 were cut off without coding the rest anew, as phones do, and are not shown.
+    """
     call = [imageio_ffmpeg.get_ffmpeg_exe(), "-nostdin", "-v", "quiet", "-i", str(video), "-map", "0:v:0"]
     done = subprocess.run([*call, "-c", "copy", "-f", "framecrc", "-"], capture_output=True)
     lines = done.stdout.decode(errors="replace").splitlines()
     unit = next((Fraction(line.split(":")[1].strip()) for line in lines if line.startswith("#tb 0:")), 1)
     ticks = (line.split(",")[2].strip() for line in lines if not line.startswith("#"))
-    return np.sort([float(int(tick) * unit) for tick in ticks if tick.lstrip("-").isdecimal()])
+    return np.sort([float(int(tick) * unit) for tick in ticks if tick.isdecimal()])
 
 
 def sound_of(video: Path, rate: int, most: float) -> np.ndarray:
