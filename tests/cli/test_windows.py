@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 import yaml
 
+import forewarp
 from forewarp.synth.scenes import synthesize
 
 SHORT = ["trainer=cpu", "threads=1", "budget.minutes=null", "budget.iterations=8", "logger=none", "sheets=0"]
@@ -13,7 +14,7 @@ SCENE = ["data=dnerf", "data.root=.", "data.scene=vehicle", "callbacks.accuracy=
 
 
 @pytest.mark.slow
-def test_windows_begin_from_what_stands_still_and_are_found_again(ok, refused, in_tmp):
+def test_windows_begin_from_what_stands_still_and_play_in_one_file(ok, refused, in_tmp):
     synthesize(Path("vehicle"), size=16, frames=12, samples_per_pixel=1, test_views=(4, 2, 1), val_views=0)
     missing = refused("train", *SHORT, *SCENE, "windows=each", "data.window=[0,0.5]")
     assert "start: expected a finished run of what stands still, but got none in" in missing
@@ -31,6 +32,15 @@ def test_windows_begin_from_what_stands_still_and_are_found_again(ok, refused, i
     assert (config["start"], config["data"]["window"]) == (str(still.resolve()), [0.5, 1])
     again = ok(*words)
     assert again.out.count("measured before") == 2
+    assert "format: expected glb or html for a film's windows" in refused("export", "run=film", "format=ply")
+    assert "film/exports/glb/scene.glb" in ok("export", "run=film", "format=glb", "seconds=5").out
+    film = forewarp.load("film/exports/glb/scene.glb")
+    assert [window.begin for window in film.gaussians.windows] == [0.0, 0.5]
+    for time in (0.0, 0.49, 0.51, 1.0):
+        assert float(film.render(film.cameras[0], time).opacity.max()) > 0.1
+    one = str(windows[1])
+    assert "1 file" in ok("export", f"run={one}", "format=glb").out
+    assert len(forewarp.load(f"{one}/exports/glb/scene.glb").gaussians.means) > 16
     other = refused("train", *SHORT, *SCENE, "windows=2", "run=film", "seed=1")
     assert "seed: expected 0, as the run that this folder holds, but got 1" in other
     wrong = refused("train", *SHORT, *SCENE, "start=film/still", "model=forward", "preset=demo")

@@ -77,7 +77,13 @@ PROTOCOL = (
     "test_moments",
     "test_frames",
 )
-PROTOCOL += ("measured", "held_out", "canonical_time", "mask_box")  # what pages tell of a run's protocol
+PROTOCOL += (
+    "window",
+    "measured",
+    "held_out",
+    "canonical_time",
+    "mask_box",
+)  # what pages tell of a run's protocol
 OWN = "run|sheets|paths.runs|paths.data"  # keys that say where a run's files are, not what it is
 # What stands for the folders of whoever types a command again.
 PLACES = {"paths.scenes": "DATASETS", "data.root": "SCENES", "lpips_weights": "WEIGHTS"}
