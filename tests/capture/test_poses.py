@@ -1,3 +1,4 @@
+import shutil
 from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
@@ -383,3 +384,32 @@ def test_turning_and_walking_are_told_apart(moves, least, most):
     ends = [1.2 * seen[:, :2] / seen[:, 2:] for seen in (points, (points - [moves, 0, 0]) @ rotation.T)]
     ends[1][:100] += rng.normal(size=(100, 2))
     assert least <= min(unrotated(*ends, focal) for focal in (1.0, 1.2, 1.6)) <= most
+
+
+def test_the_cameras_of_a_rig_are_searched_from_other_pairs_until_all_are_found(tmp_path, monkeypatch):
+    """The first model of all cameras is taken, and else that of the most."""
+
+    class Model:
+        def __init__(self, count):
+            self.count = count
+
+        def num_reg_images(self):
+            return self.count
+
+    def searched(counts, names):
+        left, angles = iter(counts), []
+
+        def mapping(database, images, place, options, **calls):
+            assert place.is_dir()
+            angles.append(options.mapper.init_min_tri_angle)
+            return {0: Model(1), 1: Model(next(left))}
+
+        monkeypatch.setattr(pycolmap, "incremental_mapping", mapping)
+        shutil.rmtree(tmp_path / "models", ignore_errors=True)
+        words = tmp_path / "a.db", tmp_path, tmp_path / "models", Search(), lambda done, total: None
+        return poses.reconstruct(*words, names).count, angles
+
+    pycolmap.Database.open(tmp_path / "a.db").close()
+    assert searched([2, 4, 3], list("abcd")) == (4, [16.0, 16.0])
+    assert searched([2, 3, 2, 1, 2], list("abcd")) == (3, [16.0, 16.0, 8.0, 6.0, 16.0])
+    assert searched([2], None) == (2, [16.0])

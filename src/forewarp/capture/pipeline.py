@@ -114,6 +114,7 @@ def find_poses(work: Path, images: Frames, search: Search, step: Step, force: bo
             poses.match(database, search, progress)
     refuse_matches(database, images, force)
     with step("poses") as progress:
+        shutil.rmtree(work / "models", ignore_errors=True)
         model = poses.reconstruct(database, images.folder, work / "models", search, progress)
     if model is None:
         refuse_poses(None, images, database)

@@ -27,6 +27,10 @@ _BATCH, _PAIR_BATCH = 8, 48  # images and pairs between two updates of the progr
 # Of the last adjustment: a point is sure from so many views and up to so many pixels of error; a camera keeps
 # its other points if it has fewer sure ones; an error of so many pixels hardly counts.
 _SURE_VIEWS, _SURE_ERROR, _MIN_POINTS, _LOSS_SCALE = 4, 1.5, 30, 0.5
+# Of a search: degrees between rays of the first two images, whether lenses bend rays from the start or
+# by the last adjustment alone, and another seed. COLMAP's own first; a share of many images is enough.
+_TRIES = (16.0, True, 0), (16.0, False, 0), (8.0, True, 0), (6.0, False, 1), (16.0, True, 2)
+_ALL = 0.9
 _START_VIEWS, _START_ERROR = 3, 1.5  # of points that particles begin from
 # In pixels of an image up to 640 wide: shift up to which a match stands still, from which on it moves, and
 # distance from lines through one point up to which matches may be of a camera that does not turn.
@@ -420,28 +424,37 @@ def reconstruct(
         folder: for what is found.
         search: how to search.
         progress: called with images done and all.
-        names: of a rig, the images to find, of which two are a model; None: all.
+        names: of a rig, the images to find, of which two are a model; None: all. Its cameras are few and far
+            apart, so that all hangs on the pair that is begun with: others are tried until all are found.
     """
     with pycolmap.Database.open(database) as base:
         total = len(names or base.read_all_images())
-    done, least = 1, MIN_MODEL if names is None else 2
+    done, best, tries = 1, None, _TRIES[: 1 if names is None else None]
 
     def count() -> None:
         nonlocal done
         done += 1
         progress(min(done, total), total)
 
-    options = pycolmap.IncrementalPipelineOptions(
-        random_seed=search.seed, num_threads=search.threads or -1, min_model_size=least
-    )
-    options.image_names = list(names or ())
-    options.mapper.random_seed = options.triangulation.random_seed = search.seed
-    pycolmap.set_random_seed(search.seed)
-    folder.mkdir(exist_ok=True)
-    models = pycolmap.incremental_mapping(
-        database, images, folder, options, initial_image_pair_callback=count, next_image_callback=count
-    )
-    return max(models.values(), key=lambda model: model.num_reg_images(), default=None)
+    for row, (angle, has_lens, seed) in enumerate(tries):
+        least = MIN_MODEL if names is None else 2
+        options = pycolmap.IncrementalPipelineOptions(
+            random_seed=search.seed + seed, num_threads=search.threads or -1, min_model_size=least
+        )
+        options.image_names = list(names or ())
+        options.mapper.random_seed = options.triangulation.random_seed = search.seed + seed
+        options.mapper.init_min_tri_angle = angle
+        options.ba_refine_extra_params = options.mapper.abs_pose_refine_extra_params = has_lens
+        pycolmap.set_random_seed(search.seed + seed)
+        place, done = folder / str(row), 1
+        place.mkdir(parents=True)
+        models = pycolmap.incremental_mapping(
+            database, images, place, options, initial_image_pair_callback=count, next_image_callback=count
+        )
+        best = max((*filter(None, [best]), *models.values()), key=lambda m: m.num_reg_images(), default=None)
+        if best is not None and best.num_reg_images() >= (_ALL if total > _FEW else 1.0) * total:
+            break
+    return best
 
 
 def adjust(
