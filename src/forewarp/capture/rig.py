@@ -24,6 +24,7 @@ import torch
 from forewarp.capture import poses, scene
 from forewarp.capture.frames import (
     MOST,
+    NO_MASKS,
     SHORT,
     TAKEN,
     Frames,
@@ -460,6 +461,7 @@ def capture_rig(
         with step("writing") as progress, folder_written_whole(out, ABOUT) as written:
             of_frames = dataclasses.replace(found, cameras=every)
             scales, moving = scene.write(written, is_timed, images, of_frames, limits, progress)
+            unmasked = f"{masks}: {NO_MASKS}" if masks is not None and not moving else None
             write_png(written / PICTURE, scene.draw(found, limits, [owner[name] for name in found.cameras]))
             facts = {
                 "source": str(folder),
@@ -468,7 +470,7 @@ def capture_rig(
                 "span": span,
                 "without": sorted({*everyone} - {*cameras}),
                 "lost": lost,
-                "told": [*([missing] if missing else []), *_suspects(cameras)],
+                "told": [*filter(None, [missing, unmasked]), *_suspects(cameras)],
                 "why": why,
                 "moments": len({*images.moments.values()}),
                 "pictures": len(images.times),
