@@ -1,5 +1,6 @@
 import wave
 from contextlib import nullcontext
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -8,7 +9,7 @@ from PIL import Image
 pytest.importorskip("pycolmap", reason="no pycolmap; make install adds it")
 
 from forewarp.capture.motion import Still
-from forewarp.capture.rig import Recording, choose, is_fixed, offsets_of, recordings, span_of
+from forewarp.capture.rig import Looks, Recording, choose, is_fixed, lost_of, offsets_of, recordings, span_of
 from tests.capture.test_sync import tracks
 from tests.support.films import numbered, write_film
 
@@ -182,3 +183,17 @@ def test_a_camera_stands_though_something_moves_and_the_light_changes():
     assert moves.shape == (240, 360)
     assert moves[65:155, 125:175].mean() > 0.95
     assert moves[:, 200:].mean() + moves[170:].mean() < 0.02
+
+
+def test_a_camera_with_poses_of_few_frames_is_lost_and_named():
+    names = {"a": ["a/1", "a/2", "a/3"], "b": ["b/1"], "c": ["c/1"]}
+    looks, matches = Looks(None, None, names, {}), {"a": (12, "b"), "b": (40, "c"), "c": (40, "b")}
+    found = SimpleNamespace(cameras=dict.fromkeys(["a/2", "b/1", "c/1"]))
+    with pytest.raises(
+        ValueError, match=r"a: expected a camera .* but got 12 matches at most, with b; .*\[a\]"
+    ):
+        lost_of(FILMS, looks, found, matches, False)
+    assert lost_of(FILMS, looks, found, matches, True) == ["a"]
+    found.cameras.pop("b/1")
+    with pytest.raises(ValueError, match=r"with b \(and b\); leave it out \(without=\[a,b\]\)"):
+        lost_of(FILMS, looks, found, matches, True)  # one camera is no rig

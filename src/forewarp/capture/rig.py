@@ -440,7 +440,7 @@ def capture_rig(
         looks = _look(work, films, taken, fixed, step)
         model, error, matches = _poses(work, films, taken, looks, search, step)
         found = dataclasses.replace(Reconstruction.of(model), error=error)
-        lost = _lost(films, looks, found, matches, force)
+        lost = lost_of(films, looks, found, matches, force)
         poses.refuse_lenses(found)
         poses.refuse_misfit(found)
         found = scene.placed(found)
@@ -457,7 +457,8 @@ def capture_rig(
                 "reprojection_error": float(np.mean(of_film)) if of_film else None,
                 "matches": matches[film.name][0],
             }
-        images, every = _frames_of(work, films, taken, looks, found, why, step)
+        used = [pair for pair in zip(films, taken) if pair[0].name not in lost]
+        images, every = _frames_of(work, *zip(*used), looks, found, why, step)
         with step("writing") as progress, folder_written_whole(out, ABOUT) as written:
             of_frames = dataclasses.replace(found, cameras=every)
             scales, moving = scene.write(written, is_timed, images, of_frames, limits, progress)
@@ -659,7 +660,7 @@ def _most_matches(database: Path, looks: Looks) -> dict[str, tuple[int, str]]:
     return most
 
 
-def _lost(films, looks: Looks, found: Reconstruction, matches: Mapping, force: bool) -> list[str]:
+def lost_of(films, looks: Looks, found: Reconstruction, matches: Mapping, force: bool) -> list[str]:
     """Name the cameras without poses: those that stand, and those with poses of less than half their frames.
 
     Raises:
