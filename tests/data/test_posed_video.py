@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+from forewarp.data.batches import Sampler
 from forewarp.data.files import SceneError
 from forewarp.data.images import write_image
 from forewarp.data.module import PosedVideoDataModule
@@ -527,5 +528,9 @@ def test_moments_number_instants_of_cameras_with_times_of_their_own(tmp_path):
     scene = read_scene(tmp_path, "toy", test_moments=[1])
     assert [frame.time for frame in scene.test] == pytest.approx([0.4, 0.6])
     assert [frame.ability for frame in scene.test] == ["time", "time"]
+    assert scene.times == pytest.approx((0.0, 0.2, 0.8, 1.0))
+    assert scene.instants == pytest.approx((0.1, 0.9))  # what comes into play together, and is counted
+    sampler = Sampler(scene, rays=4, views_per_step=2, picker=lambda: 0)
+    assert {seen.moment.frame for seen in sampler.draw().observations} == {0, 1}
     with pytest.raises(SceneError, match=r"data.test_moments: expected numbers of 0 to 2, not all"):
         read_scene(tmp_path, "toy", test_moments=[3])

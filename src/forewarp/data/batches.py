@@ -12,7 +12,7 @@ from torch.utils.data import IterableDataset
 from forewarp.data.files import mismatch
 from forewarp.data.images import StoredImage, composited, reduced
 from forewarp.ops.grid import block_means, reduced_depth
-from forewarp.scene.frame import Frame, Scene
+from forewarp.scene.frame import Frame, Scene, instants_of
 from forewarp.scene.view import Asks, Batch, Moment, Observation, Target, View
 
 COLORS = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}
@@ -74,8 +74,9 @@ class Sampler(IterableDataset):
         self.rays = None if rays is None else int(rays)
         self.views_per_step = min(int(views_per_step), self.rays or 1)
         self._of_time: dict[float, list[int]] = {}  # time -> frames
-        for index, frame in enumerate(scene.train):
-            self._of_time.setdefault(frame.time, []).append(index)
+        self._times = instants_of(scene.train)
+        for index, time in enumerate(self._times):
+            self._of_time.setdefault(time, []).append(index)
         self.seed, self._generator = seed, torch.Generator().manual_seed(seed)
 
     def __iter__(self) -> Iterator[Batch]:
@@ -91,7 +92,7 @@ class Sampler(IterableDataset):
         index = self._below(len(self.frames)) if self.picker is None else int(self.picker())
         if not 0 <= index < len(self.frames):
             raise ValueError(f"picker: expected a training frame in [0, {len(self.frames)}), but got {index}")
-        time = self.frames[index].time
+        time = self._times[index]
         same_time = [i for i in self._of_time[time] if i != index]
         frames = [index]
         if self.views_per_step > 1 and same_time:

@@ -229,7 +229,7 @@ def read_scene(
     def frame(e: ImageEntry) -> Frame:
         camera_id, camera = None if e.taken_by is None else views.index(e.taken_by), space.camera(e.camera)
         optional = {"load_valid": e.valid, "load_moving": e.moving, "camera_id": camera_id}
-        return Frame(e.name, e.time, camera, e.load, **optional)
+        return Frame(e.name, e.time, camera, e.load, **optional, moment=e.moment)
 
     train, val, test = (tuple(map(frame, parts[split])) for split in SPLITS)
     train = tuple(replace(f, load_sensed=sensed(f.name, f.camera)) for f in train)

@@ -30,7 +30,7 @@ def cut(scene: Scene, window: Sequence[float] | None) -> Scene:
     if window is None:
         return scene
     begin, end = limits_of(window)
-    times = scene.times
+    times = scene.instants
     inside = [i for i, time in enumerate(times) if _holds(begin, end, time)]
     if len(inside) < _FEWEST:
         expected = f"a window with at least {_FEWEST} of the film's {len(times)} instants"

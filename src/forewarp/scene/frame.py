@@ -23,7 +23,8 @@ class Frame:
     camera's size; without an alpha channel on disk alpha is 255. ``load_depth()``, if not None,
     gives exact ray depth (H, W) float32 in world units, 0 on the background. ``ability`` is what a test
     frame measures: ``space``, ``time``, ``space_time`` (both), ``canonical``, or ``all`` if the dataset does
-    not say. ``camera_id`` numbers the physical cameras from 0, if the dataset tells them apart.
+    not say. ``camera_id`` numbers the physical cameras from 0, if the dataset tells them apart; ``moment``
+    the instants, where cameras film together but at times of their own.
     ``load_valid()``, if not None, gives (H, W) bool: the pixels, at least one, that count in training and in
     metrics.
     ``load_moving()``, if not None, gives (H, W) bool: the pixels of what moves, which are scored apart.
@@ -45,6 +46,7 @@ class Frame:
     load_sensed: Callable[[], Tensor] | None = None
     load_covisible: Callable[[], Tensor] | None = None
     keypoints: Tensor | None = None
+    moment: int | None = None
 
     __repr__ = brief
 
@@ -89,6 +91,23 @@ class Scene:
     def times(self) -> tuple[float, ...]:
         """The distinct training times, ascending."""
         return tuple(sorted({f.time for f in self.train}))
+
+    @property
+    def instants(self) -> tuple[float, ...]:
+        """The distinct times of ``instants_of`` the training frames, ascending."""
+        return tuple(sorted({*instants_of(self.train)}))
+
+
+def instants_of(frames: Sequence[Frame]) -> list[float]:
+    """Return the time of the instant that each frame belongs to: the mean of those of one ``moment``, or its
+    own where it has none.
+    """
+    of_moment: dict[int, list[float]] = {}
+    for frame in frames:
+        if frame.moment is not None:
+            of_moment.setdefault(frame.moment, []).append(frame.time)
+    means = {moment: sum(times) / len(times) for moment, times in of_moment.items()}
+    return [frame.time if frame.moment is None else means[frame.moment] for frame in frames]
 
 
 def spread(count: int, wanted: int) -> list[int]:
@@ -164,7 +183,7 @@ def walk_of(scene: Scene) -> tuple[float, float | None] | None:
     Source: Gao et al., "Monocular Dynamic View Synthesis: A Reality Check" (2022).
     """
     frames = sorted(scene.train, key=lambda frame: frame.time)
-    if len(frames) < 3 or len(scene.times) < len(frames):
+    if len(frames) < 3 or len(scene.instants) < len(frames):
         return None
     towards = focus_point([frame.camera for frame in frames]) - torch.stack([f.camera.center for f in frames])
     towards = torch.nn.functional.normalize(towards.double(), dim=-1)

@@ -21,7 +21,7 @@ from forewarp.clock import Clock
 from forewarp.files import read_json, write_json
 from forewarp.methods.method import Model, Start, parameter_count
 from forewarp.scene.cloud import Handover
-from forewarp.scene.frame import Scene
+from forewarp.scene.frame import Scene, instants_of
 from forewarp.training.checkpoints import (
     KeepCheckpoint,
     check_state,
@@ -210,7 +210,7 @@ class Run:
         seed = self.seed + self.stages.index(stage)
         settings, objective = stage.settings.over(len(scene.train)), stage.objective
         curriculum = Curriculum(
-            [frame.time for frame in scene.train],
+            instants_of(scene.train),
             scene.canonical_time,
             **{"seed": seed, "where": f"stage.{settings.name}.curriculum", **settings.curriculum},
         )

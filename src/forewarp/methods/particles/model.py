@@ -97,7 +97,7 @@ class Particles(Method):
         self.has_planes = any(
             frame.load_valid or (self.asks.sensed and frame.load_sensed) for frame in start.scene.train
         )
-        self.views, times = len(start.scene.train), start.scene.times
+        self.views, times = len(start.scene.train), start.scene.instants
         effects = Effects(**choices).only(self.stage.effects, len(times))
         self.ends = min(times), max(times)
         self.progress = self.decay = 0.0
