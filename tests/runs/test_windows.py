@@ -18,6 +18,11 @@ def test_a_folder_is_that_of_all_windows_and_of_what_stands_still():
     assert each[2:] == ["run='my film/{hash}'", "start=my film/still", "launcher=joblib", "--multirun"]
 
 
+def test_what_stands_still_may_be_another_run():
+    (each,) = commands_of(["windows=2", "start=long/still", "run=film"])
+    assert each[2:] == ["run='film/{hash}'", "start=long/still", "--multirun"]
+
+
 def test_the_config_that_is_shown_is_the_first_windows():
     shown = ["windows=each", "data.window=[0,0.25]", "--cfg", "job"]
     assert commands_of(["windows=4", "--cfg", "job"]) == [shown]
@@ -29,7 +34,6 @@ def test_the_config_that_is_shown_is_the_first_windows():
         (["windows=1"], "windows: expected a whole number from 2 to 1000, still or each, but got 1"),
         (["windows=two"], "windows: expected a whole number from 2"),
         (["windows=2", "data.window=[0,1]"], "data.window: expected none beside windows=2"),
-        (["windows=2", "start=x"], "start: expected none beside windows=2"),
         (["windows=2", "preset=demo,fast"], "preset: expected one value beside windows=2, but got several"),
     ],
 )

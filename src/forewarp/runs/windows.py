@@ -19,7 +19,7 @@ def commands_of(arguments: Sequence[str]) -> list[list[str]]:
     """Return the command lines that one with ``windows=N`` stands for; any other stands for itself.
 
     First comes what stands still in all of the film, then a sweep over its windows, each of which begins from
-    it. ``run=FOLDER`` is the folder of all of them.
+    it. ``run=FOLDER`` is the folder of all of them. With ``start=RUN`` that run is what stands still.
 
     Raises:
         ValueError: for a number of windows that there cannot be, or a window beside it.
@@ -39,10 +39,8 @@ def commands_of(arguments: Sequence[str]) -> list[list[str]]:
         raise ValueError(
             f"windows: expected a whole number from 2 to {_MOST}, still or each, but got {value}"
         )
-    if typed := {"data.window", "start"} & {*keys}:
-        raise ValueError(
-            f"{typed.pop()}: expected none beside windows={value}; leave it out, or windows=each"
-        )
+    if "data.window" in keys:
+        raise ValueError(f"data.window: expected none beside windows={value}; leave it out, or windows=each")
     others = [one for one, key in zip(arguments, keys) if key not in ("windows", "run", "-m", "--multirun")]
     for one, key in zip(arguments, keys):
         if key != "seed" and not one.startswith("-") and is_sweep(one):
@@ -54,10 +52,12 @@ def commands_of(arguments: Sequence[str]) -> list[list[str]]:
     if folder is not None:
         folder = folder.strip("'\"")
         still.append(text_override("run", f"{folder}/still"))
-        each += [text_override("run", f"{folder}/{{hash}}"), text_override("start", f"{folder}/still")]
+        each.append(text_override("run", f"{folder}/{{hash}}"))
+        each += [] if "start" in keys else [text_override("start", f"{folder}/still")]
     if is_shown:
         return [[*each, *others]]
-    return [[*first, *others, "--multirun"] for first in (still, each)]
+    commands = [each] if "start" in keys else [still, each]
+    return [[*first, *others, "--multirun"] for first in commands]
 
 
 def _limits(count: int) -> str:
