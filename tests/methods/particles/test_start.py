@@ -16,6 +16,7 @@ from forewarp.methods.particles.start import (
     first_points,
     first_values,
     hull_surface,
+    measured,
     seen_colors,
     swept,
     widths,
@@ -128,6 +129,40 @@ def test_the_lens_of_an_image_that_is_swept_is_undone():
     shown = pixel.reshape(64, 96, 2)[8:-8, 8:-8] - 0.5
     found = 255 * rgb[8:-8, 8:-8, [1, 0]]
     assert (found - shown).abs().max() < 0.1
+
+
+def before_wall(scene, times, ball=lambda time: time, known=lambda depth: depth > 0):
+    """Frames of a camera that sees a wall at distance 4, and 2 away, at a column that time moves, a post."""
+    pose = torch.eye(4, dtype=torch.float64)
+    camera, frames = Camera(40, 20, 1e4, 1e4, 20, 10, pose, 0.1, 9.0), []  # nearly parallel rays
+    for time in times:
+        depth, at = torch.full((20, 40), 4.0), round(30 * ball(time))
+        depth[:, at : at + 10] = 2.0
+        rgba = (60 * depth[..., None]).repeat(1, 1, 4).to(torch.uint8)
+        sensed = torch.stack([depth * known(depth), torch.ones_like(depth)])
+        frames.append(Frame("a", time, camera, lambda i=rgba: i, load_sensed=lambda d=sensed: d))
+    return replace(scene, train=tuple(frames), canonical_time=times[0], has_alpha=False)
+
+
+def test_particles_begin_at_measured_depths_and_at_what_was_hidden_behind(scene_of):
+    scene = before_wall(scene_of("hypernerf"), [0.0, 1.0])
+    cloud = measured(scene, 300)
+    near = cloud.points[:, 2] < 3
+    torch.testing.assert_close(cloud.points[near, 2], torch.full((int(near.sum()),), 2.0), atol=1e-4, rtol=0)
+    torch.testing.assert_close(
+        cloud.points[~near, 2], torch.full((int((~near).sum()),), 4.0), atol=1e-4, rtol=0
+    )
+    columns = torch.stack([scene.train[0].camera.project(cloud.points)[0][:, 0], near.float()])
+    assert columns[0][near].max() < 10  # where it stood at the canonical time alone
+    assert (columns[0][~near] < 10).sum() == near.sum()  # and the wall that it hid then
+    assert cloud.colors[near].max() < 0.5 < cloud.colors[~near].min()
+    scene = before_wall(scene_of("hypernerf"), [0.0], known=lambda depth: depth < 3)
+    assert (measured(scene, 300).points[:, 2] < 3).all()
+    doubted = replace(
+        scene.train[0], load_sensed=lambda: torch.stack([torch.ones(20, 40), torch.full((20, 40), 0.1)])
+    )
+    assert measured(replace(scene, train=(doubted,)), 300) is None
+    assert measured(scene_of("hypernerf"), 300) is None
 
 
 def test_what_a_stage_left_comes_first_and_random_points_last(scene_of):
