@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import mmap
 import os
 import re
 import warnings
@@ -47,6 +48,7 @@ _LEAST_HIDDEN, _COLORS = 0.01, 64  # share of an image, and colours, that tell a
 _ROUNDED, _STRAY, _LEAST_EDGES, _EDGES_OF = 2, 0.001, 50, 4  # of an edge; share, least edges, images
 _FOREGROUND = 127  # a mask above it is foreground; masks are lossy, so never quite 0 or 255
 _COLORED = 32  # of 255: difference of channels of a mask with colours; all of a DAVIS palette are as bright
+_OWN_PAGES = 1 << 20  # bytes of a kept tensor from which it has pages of its own
 _NUMBERED = 15  # a mask nowhere above it holds numbers of objects
 # A number in a name; seconds, as of TUM's data or ROS, are Unix time, or fill the name to the microsecond.
 _NUMBER = r"((?<!\d)\d{9,10}\.\d+|(?<![^/])\d+\.(?:\d{6}|\d{9})(?=$|\.[A-Za-z])|\d+)"
@@ -87,6 +89,7 @@ class ImageCache:
         """Keep for ``owner`` what was made beside something else."""
         key = id(owner)
         if key not in self._kept and made.nbytes <= self.limit:
+            made = _in_own_pages(made) if made.nbytes >= _OWN_PAGES else made
             # Freed as soon as the owner dies; until then no other object can have its id.
             self._kept[key] = (weakref.ref(owner, lambda _: self._drop(key)), made)
             self.bytes += made.nbytes
@@ -107,6 +110,14 @@ class ImageCache:
 
     def _drop(self, key: int) -> None:
         self.bytes -= self._kept.pop(key)[1].nbytes
+
+
+def _in_own_pages(tensor: Tensor) -> Tensor:
+    """Copy a tensor to pages that go back to the system as soon as it is freed: kept amid the temporaries of
+    many steps, images leave holes behind that nothing fits into, and a process takes several times the limit.
+    """
+    pages = mmap.mmap(-1, tensor.nbytes)
+    return torch.frombuffer(pages, dtype=tensor.dtype).reshape(tensor.shape).copy_(tensor)
 
 
 CACHE = ImageCache(1_500_000_000)
