@@ -1,6 +1,7 @@
 """Images: headers, decoding, what is refused, composition, halving, cut-outs, what is kept in memory."""
 
 import gc
+import mmap
 
 import imageio.v3 as iio
 import numpy as np
@@ -10,6 +11,7 @@ from PIL import Image
 
 from forewarp.data.files import SceneError
 from forewarp.data.images import (
+    _OWN_PAGES,
     CACHE,
     ImageCache,
     StoredImage,
@@ -198,3 +200,14 @@ def test_the_limit_holds_and_the_longest_unused_goes_first():
     owners.clear()
     gc.collect()
     assert cache.bytes == 0  # an owner's end frees its image
+
+
+def test_kept_images_have_pages_of_their_own_which_are_freed_with_them():
+    cache, owners = ImageCache(4 * _OWN_PAGES), [object.__new__(StoredImage) for _ in range(8)]
+    image = torch.arange(_OWN_PAGES, dtype=torch.int32).to(torch.uint8).reshape(-1, 256, 4)
+    for owner in owners:
+        cache.get(owner, lambda: image.clone())
+    assert cache.bytes == 4 * _OWN_PAGES
+    kept = cache.get(owners[-1], lambda: None)
+    assert kept.data_ptr() % mmap.PAGESIZE == 0
+    torch.testing.assert_close(kept, image, rtol=0, atol=0)
