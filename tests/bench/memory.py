@@ -191,7 +191,7 @@ HEAD = [
     "else to the first step, s",
     "a step, processor ms",
 ]
-HEAD += ["GB before it", "training", "scoring"]
+HEAD += ["GB before it", "in training", "after it"]
 
 
 def memory_table(cases: Sequence[tuple] = ()) -> str:

@@ -120,7 +120,7 @@ def _in_own_pages(tensor: Tensor) -> Tensor:
     return torch.frombuffer(pages, dtype=tensor.dtype).reshape(tensor.shape).copy_(tensor)
 
 
-CACHE = ImageCache(1_500_000_000)
+CACHE = ImageCache(1_000_000_000)
 
 
 @dataclass(frozen=True)

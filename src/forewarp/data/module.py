@@ -205,7 +205,7 @@ class SceneDataModule(LightningDataModule):
         eval_background: str | None = None,
         seed: int = 0,
         views_per_step: int = 1,
-        cache_bytes: int = 1_500_000_000,
+        cache_bytes: int = 1_000_000_000,
         disk_cache_bytes: int = 100_000_000_000,
         held_out: int = 0,
         train_views: int | None = None,

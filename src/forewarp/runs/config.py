@@ -30,7 +30,7 @@ from forewarp.runs.overrides import constant, key_of, typed_overrides
 
 # Two runs differ if these keys differ; device, folder and what is shown do not count.
 IDENTITY = ("data", "model", "objective", "stage", "preset", "budget", "seed")
-NOT_OF_RUN = "disk_cache_bytes"  # a key of the data that changes no frame
+NOT_OF_RUN = ("cache_bytes", "disk_cache_bytes")  # keys of the data that change no frame
 HASH = "{hash}"
 # May be set beside resume=<run>.
 MAY_CHANGE = (
@@ -140,8 +140,8 @@ def content_hash(config: DictConfig, more: Sequence[str] = (), *others: object) 
     for key, part in content.items():
         if OmegaConf.is_config(part):
             content[key] = OmegaConf.to_container(part, resolve=True)
-    if isinstance(content["data"], dict):
-        content["data"].pop(NOT_OF_RUN, None)
+    for key in NOT_OF_RUN if isinstance(content["data"], dict) else ():
+        content["data"].pop(key, None)
     precision = config.trainer.get("precision")
     if config.budget.minutes is not None:
         from forewarp.runs.build import device_for  # loads torch

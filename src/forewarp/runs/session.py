@@ -126,7 +126,8 @@ def _refuse_another(path: Path, stored: DictConfig, config: DictConfig) -> None:
     keys = (*IDENTITY, "start")
     before, now = ({k: OmegaConf.to_container(c).get(k) for k in keys} for c in (stored, config))
     for part in (before["data"], now["data"]):
-        (part or {}).pop(NOT_OF_RUN, None)
+        for key in NOT_OF_RUN:
+            (part or {}).pop(key, None)
     if differ := list(_differences(before, now)):
         key, was, got = min(differ, key=lambda row: [not row[0].startswith(first) for first in _TYPED])
         more = f" (and {len(differ) - 1} more keys)" if len(differ) > 1 else ""
