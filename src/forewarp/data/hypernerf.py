@@ -372,11 +372,15 @@ def _listed(path: Path, ids: list[str]) -> list[str]:
 
 
 def _read_keypoints(path: Path) -> Tensor:
-    """Read keypoints (J, 3): x, y and whether they are seen; SceneError for other rows."""
+    """Read keypoints (J, 3): x, y and whether they are seen; SceneError for other rows. On disk the middle of
+    the first pixel is (0, 0), as dycheck's loader has it.
+    """
     rows = read_json(path, list)
     if not all(isinstance(row, list) and len(row) == 3 for row in rows):
         raise mismatch(path, "a list of [x, y, seen]", short(rows))
-    return torch.tensor([[number(value, str(path)) for value in row] for row in rows]).reshape(-1, 3)
+    points = torch.tensor([[number(value, str(path)) for value in row] for row in rows]).reshape(-1, 3)
+    points[:, :2] += 0.5 * points[:, 2:]
+    return points
 
 
 def _read_items(
@@ -452,6 +456,7 @@ def _write_shot(folder: Path, shot: RigShot, scales: Sequence[int]) -> None:
             write_image(folder / "covisible" / f"{s}x" / (shot.split or "val") / f"{shot.name}.png", mask)
         if shot.keypoints is not None:
             rows = np.asarray(shot.keypoints, float) / (s, s, 1)
+            rows[:, :2] -= 0.5 * rows[:, 2:]
             place = folder / "keypoint" / f"{s}x" / (shot.split or "train")
             write_json(place / f"{shot.name}.json", rows.tolist())
     write_camera(folder / "camera" / f"{shot.name}.json", shot.camera)
