@@ -200,7 +200,7 @@ def memory_table(cases: Sequence[tuple] = ()) -> str:
     for case in cases or (*((frames, CAMERAS, SIZE) for frames in FRAMES), *OTHERS):
         told = measure(*case)
         rows.append(row(told, *case))
-        most = max(most, told["peak"]) if case[1:3] == (CAMERAS, SIZE) else most
+        most = max(most, told["peak"]) if case[1:] == (CAMERAS, SIZE) else most
         print(dict(zip(HEAD, rows[-1])), file=sys.stderr, flush=True)
     verdict = "reached" if most <= GOAL else "**missed**"
     said = f"The most at {SIZE[0]} x {SIZE[1]} and {CAMERAS} films is {most / 1e9:.2f} GB"
