@@ -8,6 +8,7 @@ from PIL import Image
 
 pytest.importorskip("pycolmap", reason="no pycolmap; make install adds it")
 
+from forewarp.capture import rig
 from forewarp.capture.motion import Still
 from forewarp.capture.rig import Looks, Recording, choose, is_fixed, lost_of, offsets_of, recordings, span_of
 from tests.capture.test_sync import tracks
@@ -114,6 +115,16 @@ def test_cameras_are_videos_else_folders_of_numbered_images(tmp_path):
     for name in ("x 10.mp4", "x 2.mp4"):
         write_film(tmp_path / name, numbered(3))
     assert [one.name for one in recordings(tmp_path, None)] == ["x 2", "x 10"]
+
+
+def test_frames_that_are_sought_are_those_asked_for_where_the_rate_varies(tmp_path, monkeypatch):
+    """Some frames follow the one before them after a fifth of the usual time."""
+    for name in "ab":
+        write_film(tmp_path / f"{name}.mp4", numbered(12, step=20), stamps="N*40-32*floor(N/5)")
+    film, rows = recordings(tmp_path, None)[0], [0, 5, 10]
+    monkeypatch.setattr(rig, "_SEEK", 1)
+    greys = [int(pixels[-1, -1, 0]) for pixels in film.pixels(rows, None, None)]
+    assert greys == pytest.approx([20 * row for row in rows], abs=4)
 
 
 @pytest.mark.parametrize(

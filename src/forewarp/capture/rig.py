@@ -41,7 +41,7 @@ from forewarp.capture.sync import MOST as HEARD
 from forewarp.capture.sync import RATE, Synchrony, is_silent, synchronise
 from forewarp.data.images import in_order, read_image, write_image
 from forewarp.data.transforms import numbers_in
-from forewarp.data.video import VIDEOS, extracted, sound_of, stamps_of
+from forewarp.data.video import VIDEOS, extracted, sound_of, stamps_of, start_of
 from forewarp.drawing.images import write_png
 from forewarp.files import folder_written_whole, read_json, write_json
 
@@ -104,7 +104,7 @@ class Recording:
                 yield pixels
             return
         if len(rows) * _SEEK < rows[-1]:
-            starts = [None if row == 0 else float(self.stamps[row]) - self.gap / 2 for row in rows]
+            starts = (start_of(self.stamps, row) for row in rows)
             sought = (extracted(self.path, [0], size, threads, start=start) for start in starts)
             frames = (frame for film in sought for frame in film)
         else:

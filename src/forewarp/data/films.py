@@ -21,7 +21,7 @@ from torch import Tensor
 from forewarp.clock import left_out
 from forewarp.data.files import mismatch, number
 from forewarp.data.images import CACHE, by
-from forewarp.data.video import extracted
+from forewarp.data.video import extracted, start_of
 from forewarp.files import written_whole
 from forewarp.progress import Counted
 
@@ -76,11 +76,8 @@ class Film:
         Raises:
             SceneError: where one is not there, or of another size.
         """
-        gap = float(np.diff(self.stamps).min()) if len(self.stamps) > 1 else 1.0
-        after = None if start == 0 else float(self.stamps[start]) - gap / 2
-        images = extracted(
-            self.path, None, max(self.size), start=after
-        )  # ffmpeg averages several times as fast
+        # ffmpeg averages several times as fast.
+        images = extracted(self.path, None, max(self.size), start=start_of(self.stamps, start))
         for index in range(start, start + count):
             pixels = next(images, None)
             if pixels is None:

@@ -129,6 +129,13 @@ def stamps_of(video: Path) -> np.ndarray:
     return np.sort([float(int(tick) * unit) for tick in ticks if tick.isdecimal()])
 
 
+def start_of(stamps: np.ndarray, row: int) -> float | None:
+    """Return from when on ``extracted`` begins with a frame: midway from the one before it, as rates vary and
+    times are rounded; None for the first.
+    """
+    return None if row == 0 else float(stamps[row - 1] + stamps[row]) / 2
+
+
 def sound_of(video: Path, rate: int, most: float) -> np.ndarray:
     """Decode the beginning of a video's sound, one channel: (S,) float32, ``rate`` samples a second from the
     time 0 of its frames on, ``most`` seconds at most; empty where there is none.
