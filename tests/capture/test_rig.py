@@ -10,7 +10,19 @@ pytest.importorskip("pycolmap", reason="no pycolmap; make install adds it")
 
 from forewarp.capture import rig
 from forewarp.capture.motion import Still
-from forewarp.capture.rig import Looks, Recording, choose, is_fixed, lost_of, offsets_of, recordings, span_of
+from forewarp.capture.poses import Search
+from forewarp.capture.rig import (
+    Looks,
+    Recording,
+    cameras_in,
+    capture_rig,
+    choose,
+    is_fixed,
+    lost_of,
+    offsets_of,
+    recordings,
+    span_of,
+)
 from tests.capture.test_sync import tracks
 from tests.support.films import numbered, write_film
 
@@ -127,6 +139,29 @@ def test_frames_that_are_sought_are_those_asked_for_where_the_rate_varies(tmp_pa
     assert greys == pytest.approx([20 * row for row in rows], abs=4)
 
 
+def test_what_is_left_out_is_not_looked_at(tmp_path):
+    """A file that is no video can be left out, as its refusal says; offsets still count it."""
+    for name in "ac":
+        write_film(tmp_path / f"{name}.mp4", numbered(3))
+    (tmp_path / "b.mp4").write_bytes(b"no film")
+    assert list(cameras_in(tmp_path)) == ["a", "b", "c"]
+    assert [one.name for one in recordings(tmp_path, None, ["b"])] == ["a", "c"]
+    with pytest.raises(ValueError, match="offsets: expected one of each of 3 cameras, but got 1"):
+        capture_rig(tmp_path, tmp_path.parent / "out", Search(), step, without=["b"], offsets=[0])
+
+
+def test_images_of_another_size_than_a_cameras_first_are_named(tmp_path):
+    for name in "ab":
+        (tmp_path / name).mkdir()
+        for number in range(3):
+            Image.new("RGB", (80 + (number == 2), 64)).save(tmp_path / name / f"{number}.png")
+    film = recordings(tmp_path, None)[0]
+    with pytest.raises(
+        ValueError, match=r"2.png: expected 80 x 64 pixels as 0.png, but got 81 x 64; .*\[a\]"
+    ):
+        list(film.pixels([2], None, None))
+
+
 @pytest.mark.parametrize(
     ("files", "without", "says"),
     [
@@ -175,6 +210,19 @@ def test_frames_keep_their_times_and_belong_to_the_nearest_instant():
     assert [len(taken.rows) for taken in chosen] == [300, 300]
     assert why == "300 instants of up to 4000; frames= takes more"
     assert choose(films, offsets, (0.1, 0.3), 4)[0][1].moments == [0, 1, 2, 3]
+    with pytest.raises(ValueError, match="expected frames in the common time, but got none of a"):
+        choose(films, offsets, (0.304, 0.306), 4)
+
+
+def test_instants_are_those_of_a_film_that_runs_all_the_while():
+    """The first film ends early; another has twice the rate, but begins late."""
+    films = [film("a", 20), *(film(name, 120) for name in "bcdefg"), film("h", 140, 60.0, start=1.0)]
+    *others, late = choose(films, np.zeros(8), span_of(films, np.zeros(8))[:2], None)[0]
+    for taken in others:
+        assert taken.moments == taken.rows
+    assert len(late.rows) > 120
+    apart = np.array(late.moments) / 30 - late.times
+    assert np.abs(apart).max() <= 0.5 / 30 + 1e-9
 
 
 def textured(shift=0, seed=0):

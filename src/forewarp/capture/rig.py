@@ -39,7 +39,8 @@ from forewarp.capture.pipeline import ABOUT, PICTURE, fingerprint, keep, kept, r
 from forewarp.capture.poses import Reconstruction, Search
 from forewarp.capture.sync import MOST as HEARD
 from forewarp.capture.sync import RATE, Synchrony, is_silent, synchronise
-from forewarp.data.images import in_order, read_image, write_image
+from forewarp.data.files import mismatch
+from forewarp.data.images import by, in_order, read_image, write_image
 from forewarp.data.transforms import numbers_in
 from forewarp.data.video import VIDEOS, extracted, sound_of, stamps_of, start_of
 from forewarp.drawing.images import write_png
@@ -49,11 +50,8 @@ _INSTANTS, _POLLUTED = 9, 1 / 3  # of a still; share of them in which a pixel th
 _SEEK = 600  # frames after which a film's instants are sought, not decoded on the way
 _MOST_IMAGES = 6000  # of all cameras, where frames= does not say so
 _FLOW = 320  # pixels of the longer side in which a camera's own motion is looked for
-_EDGES, _RESTS, _AT_REST = (
-    20.0,
-    1.0,
-    0.5,
-)  # gradient of texture; pixels of 640; share that rests if it is fixed
+# Gradient of texture; pixels of 640; share that rests if it is fixed.
+_EDGES, _RESTS, _AT_REST = 20.0, 1.0, 0.5
 _LOOKS = 24  # frames of a moving camera that are matched with each other camera
 _LEAST_SPAN = 0.5  # of the median film, below which a few may miss parts of the span
 _MOST_OF = 0.75  # of the cameras: so many film all of the span then
@@ -96,8 +94,12 @@ class Recording:
             ValueError: where one is not there.
         """
         if self.images:
+            first = read_image(self.images[0], upright=True).shape
             for row in rows:
                 pixels = read_image(self.images[row], upright=True).numpy()[..., :3]
+                if pixels.shape[:2] != first[:2]:
+                    expected = f"{by(first[1::-1])} pixels as {self.images[0].name}"
+                    raise mismatch(self.images[row], expected, by(pixels.shape[1::-1]), _without(self.name))
                 longer = max(pixels.shape[:2])
                 if size is not None and size < longer:
                     pixels = shrunk(pixels, *(max(1, round(n * size / longer)) for n in pixels.shape[:2]))
@@ -120,16 +122,11 @@ class Recording:
             )
 
 
-def recordings(folder: Path, rate: float | None, without: Sequence[str] = ()) -> list[Recording]:
-    """Find the cameras of a rig: a video of any name for each, else a sub-folder of images for each.
-
-    Args:
-        folder: of the videos or sub-folders.
-        rate: images a second of sub-folders; None: their times are numbers.
-        without: names of those to leave out.
+def cameras_in(folder: Path) -> dict[str, Path]:
+    """Find the cameras of a rig, in the order of names: a video for each, else a sub-folder of images.
 
     Raises:
-        ValueError: for fewer than two, for what is no video, and for a name to leave out that is not there.
+        ValueError: for fewer than two, and for two videos of one name.
     """
     there = [path for path in folder.iterdir() if not path.name.startswith(".")]
     paths = [path for path in there if path.is_file() and path.suffix.lower() in VIDEOS]
@@ -144,8 +141,23 @@ def recordings(folder: Path, rate: float | None, without: Sequence[str] = ()) ->
         raise ValueError(
             f"videos: expected at least two videos, or sub-folders of pictures, in {folder}, but got {got}"
         )
+    return {name: found[name] for name in in_order(found)}
+
+
+def recordings(folder: Path, rate: float | None, without: Sequence[str] = ()) -> list[Recording]:
+    """Look at what each camera of a rig took.
+
+    Args:
+        folder: see ``cameras_in``.
+        rate: images a second of sub-folders; None: their times are numbers.
+        without: names of cameras to leave out, which are not looked at.
+
+    Raises:
+        ValueError: for fewer than two, for what is no video, and for a name to leave out that is not there.
+    """
+    found = cameras_in(folder)
     _refuse_unknown("without", without, found)
-    used = [name for name in in_order(found) if name not in without]
+    used = [name for name in found if name not in without]
     if len(used) < 2:
         raise ValueError(f"without: expected at least two cameras left, but got {len(used)} of {len(found)}")
     return [_recording(name, found[name], rate) for name in used]
@@ -314,7 +326,8 @@ def choose(
 ) -> tuple[list[Taken], str]:
     """Choose frames of all films, and say why so many.
 
-    Of a short span every frame; its instants are the first film's frames, and a frame belongs to the nearest.
+    Of a short span every frame; its instants are the frames of the film that has most, of those that run all
+    the while, and a frame belongs to the nearest.
     Of a longer one evenly spread instants, and of each film the frame nearest to each. Frames keep times of
     their own.
     """
@@ -325,17 +338,21 @@ def choose(
     most = max(map(len, inside))
     limit = min(MOST, max(2, _MOST_IMAGES // len(films)))
     if count is None and most <= min(SHORT, limit):
-        rows, grid, why = inside, clocks[0], "every frame of short films"
+        runs = [clock[0] <= begin + 2e-6 * gap and clock[-1] >= end - 2e-6 * gap for clock in clocks]
+        fullest = max(range(len(films)), key=lambda film: (runs[film], len(inside[film])))
+        rows, grid, why = inside, clocks[fullest], "every frame of short films"
     else:
-        asked = min(most, limit if count is None else count)
+        asked = max(2, min(most, limit if count is None else count))
         grid = np.linspace(*span, asked)
         why = (
             "frames= says so"
             if count is not None
             else f"{asked} instants of up to {most}; frames= takes more"
         )
-        rows = [_nearest(clock, grid, film.gap) for clock, film in zip(clocks, films)]
-    nearest = [np.abs(clock[mine][:, None] - grid).argmin(1) for clock, mine in zip(clocks, rows)]
+        # Where there is none within a frame of an instant, a film has none of it.
+        near = [(_nearest(clock, grid), clock, film.gap) for clock, film in zip(clocks, films)]
+        rows = [np.unique(mine[np.abs(clock[mine] - grid) <= gap]) for mine, clock, gap in near]
+    nearest = [_nearest(grid, clock[mine]) for clock, mine in zip(clocks, rows)]
     first = min(int(moments.min(initial=len(grid))) for moments in nearest)
     chosen = [
         Taken(mine.tolist(), clock[mine].tolist(), (moments - first).tolist())
@@ -349,11 +366,10 @@ def choose(
     return chosen, why
 
 
-def _nearest(clock: np.ndarray, grid: np.ndarray, gap: float) -> np.ndarray:
-    """Find the frames nearest to instants; where there is none within a frame, it has none."""
-    right = np.searchsorted(clock, grid).clip(1, len(clock) - 1)
-    rows = np.where(grid - clock[right - 1] <= clock[right] - grid, right - 1, right)
-    return np.unique(rows[np.abs(clock[rows] - grid) <= gap])
+def _nearest(clock: np.ndarray, times: np.ndarray) -> np.ndarray:
+    """Find which of two or more ascending instants is the nearest to each time."""
+    right = np.searchsorted(clock, times).clip(1, len(clock) - 1)
+    return np.where(times - clock[right - 1] <= clock[right] - times, right - 1, right)
 
 
 def is_fixed(images: Sequence[np.ndarray]) -> bool:
@@ -421,8 +437,7 @@ def capture_rig(
     without = [str(name) for name in without]  # a name of digits is read as a number
     if isinstance(offsets, Mapping):
         offsets = {str(name): seconds for name, seconds in offsets.items()}
-    everyone = [film.name for film in recordings(folder, rate)]
-    films = recordings(folder, rate, without)
+    everyone, films = list(cameras_in(folder)), recordings(folder, rate, without)
     about = {"videos": folder, "masks": masks, "fixed": fixed, "rate": rate, "frames": frames, "size": size}
     about |= {"offsets": offsets, **dataclasses.asdict(search)}
     del about["threads"]
@@ -700,11 +715,11 @@ def _frames_of(
             cameras |= posed
             if work.masks is None and not stands and posed:
                 paths = [work.folder / "pictures" / name for name in posed]
-                masks = list(moving_masks(paths, list(posed.values())))
-                told.add(2 * sum(mask is not None for mask in masks) > len(masks) and "optical flow")
-                for name, mask in zip(posed, masks):
-                    nothing = np.zeros((size[1], size[0]), bool)
+                nothing, known = np.zeros((size[1], size[0]), bool), 0
+                for name, mask in zip(posed, moving_masks(paths, list(posed.values()))):
+                    known += mask is not None
                     _write_mask(work.folder / "masks" / f"{name}.png", nothing if mask is None else mask)
+                told.add(2 * known > len(posed) and "optical flow")
             elif posed:
                 told.add("the masks given" if work.masks else "differences from what is mostly there")
     names = [film.frame(row) for film, mine in zip(films, taken) for row in mine.rows]

@@ -44,12 +44,8 @@ from forewarp.runs.overrides import command_line, text_override
 
 MATCHING = ("auto", "sequential", "exhaustive")
 PATHS = ("video", "videos", "images", "colmap", "masks", "out")
-RIG = {
-    "offsets": None,
-    "without": [],
-    "fixed": None,
-    "rate": None,
-}  # keys of several cameras, and none of them
+# Keys of several cameras, and what they are where they are not set.
+RIG = {"offsets": None, "without": [], "fixed": None, "rate": None}
 LEAST_HELD = 4  # cameras from which on one is held out by the command that comes next
 SUFFIX = ".r3d"  # of scans by Record3D
 LENSES = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
@@ -69,7 +65,7 @@ def capture(config) -> None:
 
     if type(config.force) is not bool:
         raise ValueError(f"force: expected true or false, but got {config.force}")
-    if source["video"] is not None and source["video"].suffix == SUFFIX:
+    if is_scan(source["video"]):
         from forewarp.capture import record3d
         from forewarp.capture.pipeline import ABOUT
 
@@ -101,6 +97,11 @@ def tell(lines: list[str], out, held: Sequence[str] = ()) -> None:
     print(f"written: {out}" + (f"; see {drawn}" if drawn.is_file() else ""))
     where = [text_override("data.root", str(out.parent)), text_override("data.scene", out.name), *held]
     print(f"next: {command_line('train', ['experiment=video_with_poses', *where])}")
+
+
+def is_scan(video) -> bool:
+    """Tell whether a file is a scan by Record3D, by its name."""
+    return video is not None and video.suffix.lower() == SUFFIX
 
 
 def check(config) -> tuple[dict, object]:
@@ -148,10 +149,9 @@ def check(config) -> tuple[dict, object]:
     for key, known in (("matching", MATCHING), ("lens", LENSES)):
         if config[key] not in known:
             raise ValueError(f"{key}: expected one of {', '.join(known)}, but got '{config[key]}'")
-    is_scan = video is not None and video.suffix == SUFFIX
-    if typed := [key for key in ("masks", "colmap") if is_scan and source[key] is not None]:
+    if typed := [key for key in ("masks", "colmap") if is_scan(video) and source[key] is not None]:
         raise ValueError(f"{typed[0]}: expected none beside a scan of Record3D, but got one; remove it")
-    for package in ("pycolmap", "cv2", *(["lzfse"] if is_scan else [])):
+    for package in ("pycolmap", "cv2", *(["lzfse"] if is_scan(video) else [])):
         if find_spec(package) is None:
             raise ImportError(f"capture: expected {package}, but got none; install forewarp[capture]")
     out = Path(config.out or Path("captures") / (video or videos or images).resolve().stem)
