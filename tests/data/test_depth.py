@@ -5,7 +5,7 @@ import pytest
 import torch
 from PIL import Image
 
-from forewarp.data.depth import SensedDepth, line_through
+from forewarp.data.depth import SensedDepth, confidence_of, depths_beside, line_through
 from forewarp.data.files import SceneError
 from forewarp.data.posed_video import FILE, read_scene
 from forewarp.scene.camera import Camera
@@ -55,6 +55,8 @@ def test_a_line_needs_points_that_agree():
     assert line_through(given[:9], given[:9] + 1) is None
     assert line_through(given, 40 - given) is None  # what falls is no depth
     assert line_through(np.ones(30), given + 1) is None
+    a, b = line_through(1e11 * given, given + 2)
+    assert (a, b) == (pytest.approx(1e-11), pytest.approx(2))  # of values of any size
 
 
 def test_depth_of_a_video_is_in_the_units_of_its_poses(tmp_path):
@@ -80,14 +82,38 @@ def test_depth_of_a_video_is_in_the_units_of_its_poses(tmp_path):
     assert frames["images/frame_4"].load_sensed is None
     larger = read_scene(tmp_path, "toy", depth=str(tmp_path / "lidar"), depth_scale=2e-3).train[0]
     torch.testing.assert_close(larger.load_sensed()[0], 2 * frames[larger.name].load_sensed()[0])
-    for place in (folder / FILE,):
-        edit(place, {"frames.0.depth_file_path": "../lidar/frame_1.png"})
+    edit(folder / FILE, {"frames.0.depth_file_path": "../lidar/frame_1.png"})
     with pytest.raises(SceneError, match="depth_file_path"):
         read_scene(tmp_path, "toy")
     (tmp_path / "lidar").rename(folder / "lidar")
     edit(folder / FILE, {"frames.0.depth_file_path": "lidar/frame_1.png"})
     assert read_scene(tmp_path, "toy").protocol["depth"] == "metric, of 1 of 9 training frames"
     assert "depth" not in read_scene(tmp_path, "toy", depth="off").protocol
+    edit(folder / FILE, {"frames.1.depth_file_path": "lidar/none.png"})
+    scene = read_scene(tmp_path, "toy")
+    assert scene.protocol["depth"] == "metric, of 1 of 9 training frames"
+    (line,) = (line for line in scene.protocol["assumed"] if "depth" in line.rpartition("/")[2])
+    assert line.endswith("lidar/none.png: 1 of 2 depths are not there: images go without")
+    edit(folder / FILE, {"frames.1.depth_file_path": "lidar/2.exr"})
+    with pytest.raises(SceneError, match=r"2.exr: expected a depth in .npy or .png, but got .exr; .*=off"):
+        read_scene(tmp_path, "toy")
+    edit(folder / FILE, {"frames.0.depth_file_path": "2.npy", "frames.1.depth_file_path": "2.npy"})
+    np.save(folder / "2.npy", np.full((10, 15), 40.0))
+    assert read_scene(tmp_path, "toy").train[0].load_sensed()[1].min() == 1
+
+
+def test_confidences_lie_as_depths_do_and_a_depth_is_of_one_image(tmp_path):
+    for kind in ("depth", "confidence"):
+        for camera in ("cam0", "cam1"):
+            (tmp_path / kind / camera).mkdir(parents=True)
+            np.save(tmp_path / kind / camera / "1.npy", np.ones((2, 3)))
+    names = ["images/cam0/1", "images/cam1/1"]
+    found = depths_beside(tmp_path / "depth", names)
+    places = [confidence_of(found[name], tmp_path / "depth") for name in names]
+    assert places == [tmp_path / "confidence" / camera / "1.npy" for camera in ("cam0", "cam1")]
+    np.save(tmp_path / "1.npy", np.ones((2, 3)))
+    with pytest.raises(SceneError, match="1.npy: expected a depth for each image, but got one for images/c"):
+        depths_beside(tmp_path, names)
 
 
 @pytest.mark.parametrize(
@@ -104,6 +130,7 @@ def test_depth_of_a_video_is_in_the_units_of_its_poses(tmp_path):
             "data.depth_kind: expected points that never move, to fit",
         ),
         ({"depth": "some", "depth_scale": 0}, "data.depth_scale: expected"),
+        ({"depth": False}, "data.depth: expected a folder, off or null, but got False"),
         (
             {"depth": "other"},
             "other: expected depths named as images, frame_1.npy or .png, but got none of them",

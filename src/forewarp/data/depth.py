@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
 
@@ -102,8 +102,9 @@ def line_through(given: np.ndarray, true: np.ndarray) -> tuple[float, float] | N
     Returns:
         None for fewer than ``_LEAST`` points, or where hardly more than some agree with any line.
 
-    >>> line_through(np.arange(1.0, 21.0), np.append(3 * np.arange(1.0, 19.0) + 2, [1.0, 500.0]))
-    (3.0, 2.0)
+    >>> line = line_through(np.arange(1.0, 21.0), np.append(3 * np.arange(1.0, 19.0) + 2, [1.0, 500.0]))
+    >>> np.round(line, 9).tolist()
+    [3.0, 2.0]
     """
     if len(given) < _LEAST:
         return None
@@ -118,14 +119,14 @@ def line_through(given: np.ndarray, true: np.ndarray) -> tuple[float, float] | N
         return None
     columns = np.stack([given[best] / true[best], 1 / true[best]], 1)  # errors count by their share
     a, b = np.linalg.lstsq(columns, np.ones(len(columns)), rcond=None)[0]
-    return round(float(a), 9), round(float(b), 9)
+    return float(a), float(b)
 
 
 def depths_beside(folder: Path, names: Sequence[str]) -> dict[str, Path]:
     """Find the files of images' depth in a folder, by the images' names with or without their own folder.
 
     Raises:
-        SceneError: where there is none at all.
+        SceneError: where there is none at all, and where one is of two images.
     """
     if not folder.is_dir():
         raise mismatch("data.depth", "a folder of depths", folder, "set data.depth=null to do without")
@@ -134,17 +135,50 @@ def depths_beside(folder: Path, names: Sequence[str]) -> dict[str, Path]:
     if not found:
         expected = f"depths named as images, {Path(names[0]).name}.npy or .png"
         raise mismatch(folder, expected, "none of them", "set data.depth=null to do without")
+    image_of: dict[Path, str] = {}
+    for name, path in found.items():
+        if (first := image_of.setdefault(path, name)) != name:
+            advice = "put them into folders as the images'"
+            raise mismatch(path, "a depth for each image", f"one for {first} and {name}", advice)
     return found
 
 
-def confidence_of(depth: Path) -> Path | None:
-    """Find a depth's confidence, by its name in the folder ``confidence`` beside its own; None without."""
-    return _beside(depth.parent.parent / "confidence", depth.stem)
+def depths_named(paths: Mapping[str, Path]) -> tuple[dict[str, Path], list[str]]:
+    """Keep those files of images' depth that are there; say in a line how many are not.
+
+    Raises:
+        SceneError: for one of another kind.
+    """
+    for path in paths.values():
+        if path.suffix not in SUFFIXES:
+            advice = "convert it, or set data.depth=off to do without"
+            raise mismatch(path, f"a depth in {' or '.join(SUFFIXES)}", path.suffix or "no suffix", advice)
+    there = {name: path for name, path in paths.items() if path.is_file()}
+    if len(there) == len(paths):
+        return there, []
+    absent = next(path for name, path in paths.items() if name not in there)
+    return there, [
+        f"{absent}: {len(paths) - len(there)} of {len(paths)} depths are not there: images go without"
+    ]
+
+
+def confidence_of(depth: Path, folder: Path) -> Path | None:
+    """Find the confidence of a depth somewhere in ``folder``, by its name from there on in the folder
+    ``confidence`` beside that; None without, and where the depth is ``folder`` itself.
+    """
+    if depth == folder:
+        return None
+    name = depth.relative_to(folder).with_suffix("").as_posix()
+    return _stored(folder.parent / "confidence", name)
 
 
 def _beside(folder: Path, name: str) -> Path | None:
     stems = name, name.partition("/")[2], name.rpartition("/")[2]
-    paths = (folder / f"{stem}{suffix}" for stem in stems if stem for suffix in SUFFIXES)
+    return next(filter(None, (_stored(folder, stem) for stem in stems if stem)), None)
+
+
+def _stored(folder: Path, name: str) -> Path | None:
+    paths = (folder / f"{name}{suffix}" for suffix in SUFFIXES)
     return next((path for path in paths if path.is_file()), None)
 
 

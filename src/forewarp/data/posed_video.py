@@ -25,7 +25,15 @@ from torch import Tensor
 
 from forewarp.data.arrays import read_cloud, write_array
 from forewarp.data.cameras import MOST_UNITS, SPLITS, box_of, opengl_rows, space_of
-from forewarp.data.depth import KINDS, LEVELS, MILLIMETRES, SensedDepth, confidence_of, depths_beside
+from forewarp.data.depth import (
+    KINDS,
+    LEVELS,
+    MILLIMETRES,
+    SensedDepth,
+    confidence_of,
+    depths_beside,
+    depths_named,
+)
 from forewarp.data.directions import check_directions
 from forewarp.data.files import (
     frames_of,
@@ -208,11 +216,17 @@ def read_scene(
 
     cloud = _points_of(file, content)
     still = None if cloud is None else space.points(read_cloud(cloud, 3)).float()
-    depths = {entry.name: entry.depth for entry in entries if entry.depth is not None and depth is None}
     if depth_kind not in KINDS:
         raise mismatch("data.depth_kind", f"one of {', '.join(KINDS)}", repr(depth_kind))
-    if depth not in (None, "off"):
-        depths = depths_beside(file.parent / depth, [entry.name for entry in parts["train"]])
+    if not isinstance(depth, (str, Path, type(None))):
+        raise mismatch("data.depth", "a folder, off or null", repr(depth))
+    depths, place = {}, None if depth in (None, "off") else file.parent / depth
+    if depth is None:
+        named = {entry.name: entry.depth for entry in parts["train"] if entry.depth is not None}
+        depths, told_of_depths = depths_named(named)
+        assumed += told_of_depths
+    elif place is not None:
+        depths = depths_beside(place, [entry.name for entry in parts["train"]])
     if depths and depth_kind != "metric" and still is None:
         advice = "write points.npy, or set data.depth_kind=metric"
         raise mismatch("data.depth_kind", "points that never move, to fit depth to", "none", advice)
@@ -224,7 +238,8 @@ def read_scene(
         if depth_kind == "metric":
             unit = (MILLIMETRES if path.suffix == ".png" else 1.0) if depth_scale is None else depth_scale
             unit = number(unit, "data.depth_scale", 1 / MOST_UNITS, MOST_UNITS) * space.scale
-        return SensedDepth(path, camera, unit, confidence_of(path), depth_kind, still)
+        top = place or file.parent / path.relative_to(file.parent).parts[0]
+        return SensedDepth(path, camera, unit, confidence_of(path, top), depth_kind, still)
 
     def frame(e: ImageEntry) -> Frame:
         camera_id, camera = None if e.taken_by is None else views.index(e.taken_by), space.camera(e.camera)
@@ -496,7 +511,7 @@ def write_scene(
         ValueError: for a shot that ``read_scene`` would refuse.
     """
     folder = Path(folder)
-    remove(folder, FILE, POINTS)
+    remove(folder, FILE, POINTS, "confidence/**/*.npy")  # which is read wherever a depth is
     entries, lists, taken = [], {split: [] for split in SPLITS}, set()
     for shot in shots:
         entries.append(_write_shot(folder, shot, taken) | ({} if mask is None else {"mask_path": mask}))
