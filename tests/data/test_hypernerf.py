@@ -302,6 +302,11 @@ def test_splits_take_the_place_of_the_lists(tmp_path):
         scene = read_scene(tmp_path, "toy", split=split)
         assert [f.name for f in scene.train] == train
         assert [f.name for f in scene.test] == (test or ["1_00000", "1_00001"])
+    edit(folder / "splits" / "val.json", {"frame_names.0": "0_00001"})
+    with pytest.raises(
+        SceneError, match="val.json: frame_names: expected none of train.json, but got '0_000"
+    ):
+        read_scene(tmp_path, "toy")
     edit(folder / "splits" / "val.json", {"frame_names.0": "none"})
     with pytest.raises(SceneError, match="val.json: frame_names: expected items of dataset.json, but got"):
         read_scene(tmp_path, "toy")

@@ -132,6 +132,9 @@ def read_scene(
         train_ids, test_ids = (
             _listed(folder / "splits" / f"{part}.json", ids) for part in (of_train, of_test)
         )
+        if both := {*train_ids} & {*test_ids}:
+            where = folder / "splits" / f"{of_test}.json"
+            raise mismatch(f"{where}: frame_names", f"none of {of_train}.json", short(min(both)))
         how = f"splits/{of_train}.json and {of_test}.json"
     times, camera_ids, numbers, assumed = _read_items(folder / "metadata.json", ids)
     where = f"{folder / 'dataset.json'}: ids"
