@@ -104,6 +104,8 @@ def test_frames_may_be_fewer_and_have_times_and_lenses_of_their_own(tmp_path):
         ({"poses": [[0.0] * 6] * 9}, "metadata: poses: expected 7 numbers for each frame, but got"),
         ({"K": [1.0]}, r"metadata: K: expected 9 numbers, but got \[1.0\]"),
         ({"dw": None}, "metadata: dw: expected a number"),
+        ({"dw": 10**5}, r"metadata: dw: expected a number in \[1, 2048\], but got 100000"),
+        ({"rgbd/4.depth": bytes(5000)}, "rgbd/4.depth: expected at most 4528 bytes, but got 5000"),
         ({"frameTimestamps": [1.0]}, "frameTimestamps: expected a list of 9, as there are poses, but got"),
         ({"rgbd/4.depth": b"nothing"}, "rgbd/4.depth: expected data compressed by LZFSE, but got others"),
         (

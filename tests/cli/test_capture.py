@@ -60,6 +60,7 @@ FILM = "video=a.mp4"
         (["video=empty"], "video: expected an existing file, but got another thing: empty"),
         (["images=a.mp4"], "images: expected an existing folder, but got another thing"),
         ([FILM, "colmap=empty"], "colmap: expected images=FOLDER beside it, but got video="),
+        (["video=A.R3D", "masks=empty"], "masks: expected none beside a scan of Record3D, but got one"),
         ([FILM, "frames=2"], "frames: expected a whole number of at least 3, but got 2"),
         ([FILM, "size=10"], "size: expected a whole number of at least 64, but got 10"),
         ([FILM, "seed=-1"], r"seed: expected a whole number in \[0, 2147483548\], but got -1"),
@@ -75,7 +76,7 @@ FILM = "video=a.mp4"
 def test_mistakes_end_before_anything_is_loaded(in_tmp, words, says):
     for folder in ("empty", "full/empty"):
         (in_tmp / folder).mkdir(parents=True)
-    for file in ("a.mp4", "full/theirs"):
+    for file in ("a.mp4", "A.R3D", "full/theirs"):
         (in_tmp / file).touch()
     config = OmegaConf.merge(OmegaConf.load(CONF / "capture.yaml"), OmegaConf.from_dotlist(words))
     with pytest.raises(ValueError, match=says):

@@ -30,6 +30,8 @@ from forewarp.scene.camera import Camera
 from forewarp.scene.frame import spread
 
 _MOST_SIDE, _MOST_UNITS, _MOST_BYTES = 1e5, 1e6, 200_000_000
+_MOST_DEPTH_SIDE = 2048  # pixels; LiDARs have 256 x 192, cameras of the face 640 x 480
+_OVERHEAD = 4096  # bytes, at most, that compressed data are larger by: LZFSE stores blocks that do not shrink
 _SAMPLED, _SMALLER = 16, 2  # depths that tell near and far; how many times smaller the copies are
 _ENDS = ((0.001, 0.75), (0.999, 1.25))  # of near and far: quantile of all depths, and room beside it
 
@@ -106,8 +108,8 @@ class _Scan:
             raise mismatch(f"{path}: metadata", "an object", short(about))
         self.about = about
         self.size, self.of_depth = (
-            tuple(int(self._number(key, about.get(key), 1, _MOST_SIDE)) for key in keys)
-            for keys in (("w", "h"), ("dw", "dh"))
+            tuple(int(self._number(key, about.get(key), 1, most)) for key in keys)
+            for keys, most in ((("w", "h"), _MOST_SIDE), (("dw", "dh"), _MOST_DEPTH_SIDE))
         )
         self.poses = self._rows("poses", 7)
         if not self.poses:
@@ -144,13 +146,13 @@ class _Scan:
         name = f"rgbd/{i}.conf"
         return self._plane(name, np.uint8) if name in self.archive.NameToInfo else None
 
-    def member(self, name: str) -> bytes:
-        """Return the bytes of a file in the archive."""
+    def member(self, name: str, most: int = _MOST_BYTES) -> bytes:
+        """Return the bytes of a file in the archive, at most ``most``."""
         where = f"{self.path}: {name}"
         if name not in self.archive.NameToInfo:
             raise mismatch(where, "this file in the archive", "none")
-        if (size := self.archive.getinfo(name).file_size) > _MOST_BYTES:
-            raise mismatch(where, f"at most {_MOST_BYTES} bytes", size)
+        if (size := self.archive.getinfo(name).file_size) > most:
+            raise mismatch(where, f"at most {most} bytes", size)
         try:
             return self.archive.read(name)
         except Exception as error:  # BadZipFile, zlib.error, RuntimeError and more
@@ -160,11 +162,12 @@ class _Scan:
         import lzfse
 
         (width, height), where = self.of_depth, f"{self.path}: {name}"
+        size = width * height * np.dtype(kind).itemsize
         try:
-            raw = lzfse.decompress(self.member(name))
+            raw = lzfse.decompress(self.member(name, size + _OVERHEAD))
         except lzfse.error as error:
             raise mismatch(where, "data compressed by LZFSE", "others") from error
-        if len(raw) != width * height * np.dtype(kind).itemsize:
+        if len(raw) != size:
             raise mismatch(where, f"{width} x {height} numbers as dw and dh say", f"{len(raw)} bytes")
         return np.frombuffer(raw, kind).reshape(height, width)
 
