@@ -1,12 +1,14 @@
 """Windows of a film begin from what stands still in all of it, and leave that as it is."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
 from forewarp.methods.method import Start
-from forewarp.methods.particles import density
+from forewarp.methods.particles import density, shared
 from forewarp.methods.particles.model import Particles
-from forewarp.methods.particles.shared import left_alone, wrong_pixels
+from forewarp.methods.particles.shared import left_alone, moments_of, wrong_pixels
 from tests.support.particles import BARE, EVERY, look, module_with, small_data
 
 DATA = small_data()
@@ -83,6 +85,20 @@ def test_the_next_stage_and_a_checkpoint_know_what_is_shared(window):
     loaded.load_state_dict(state | {k: v for k, v in loaded.state_dict().items() if k not in state})
     assert torch.equal(loaded.method.shared, method.shared)
     assert "shared" not in dict(module_with(DATA, **EVERY).method.named_buffers())
+
+
+def test_cameras_that_film_together_at_times_of_their_own_are_asked_together(still, monkeypatch):
+    """What moves is told by all views of an instant, never by one of them alone."""
+    late = [replace(f, time=min(f.time + 0.01, 1.0), moment=i) for i, f in enumerate(DATA.scene.train)]
+    train = tuple(replace(f, moment=i) for i, f in enumerate(DATA.scene.train))
+    scene = replace(DATA.scene, train=(*train, *late))
+    assert [[frame.moment for frame in frames] for frames in moments_of(scene)] == [[i, i] for i in range(6)]
+    asked = []
+    monkeypatch.setattr(
+        shared, "wrong_pixels", lambda still, frame: asked.append(frame) or frame.load()[..., 3] > 0
+    )
+    shared._on_what_moves(still, Start(scene, "fine", {}, [0], None, still, shares=True), 10)
+    assert [frame.moment for frame in asked] == [0, 0]
 
 
 def test_pixels_are_wrong_where_an_image_shows_something_else():

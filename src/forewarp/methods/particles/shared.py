@@ -13,7 +13,7 @@ from torch import Tensor
 from forewarp.methods.method import Start
 from forewarp.methods.particles.start import first_points, first_values, widths
 from forewarp.ops.grid import dilate
-from forewarp.scene.frame import Frame, Scene, sightings, spread
+from forewarp.scene.frame import Frame, Scene, instants_of, sightings, spread
 from forewarp.scene.view import Moment, View
 
 if TYPE_CHECKING:
@@ -69,8 +69,8 @@ def _on_what_moves(still: Particles, start: Start, count: int) -> dict[str, Tens
     """Make at most ``count`` particles where images of the canonical time show ``still`` to be wrong."""
     scene = start.scene
     cloud = first_points(replace(start, handover=None), _POINTS)
-    now = [frame for frame in scene.train if frame.time == scene.canonical_time]
-    now = [now[i] for i in spread(len(now), _CAMERAS)]
+    canonical = min(scene.instants, key=lambda time: abs(time - scene.canonical_time))
+    now = _frames_at(scene, canonical)
     masks = [wrong_pixels(still, frame) for frame in now]
     wrong, seen = sightings(cloud.points, [frame.camera for frame in now], masks)
     rows = ((seen > 0) & (wrong >= _NEW * seen)).nonzero()[:, 0]
@@ -82,10 +82,15 @@ def _on_what_moves(still: Particles, start: Start, count: int) -> dict[str, Tens
 
 
 def moments_of(scene: Scene) -> list[list[Frame]]:
-    """Return training frames of some moments, evenly spread: those of some cameras of each."""
-    times = [scene.times[i] for i in spread(len(scene.times), _MOMENTS)]
-    moments = [[frame for frame in scene.train if frame.time == time] for time in times]
-    return [[frames[i] for i in spread(len(frames), _CAMERAS)] for frames in moments]
+    """Return training frames of some instants, evenly spread: those of some cameras of each."""
+    instants = scene.instants
+    return [_frames_at(scene, instants[i]) for i in spread(len(instants), _MOMENTS)]
+
+
+def _frames_at(scene: Scene, instant: float) -> list[Frame]:
+    """Return the training frames of one of ``scene.instants``, of some cameras where there are many."""
+    frames = [frame for frame, time in zip(scene.train, instants_of(scene.train)) if time == instant]
+    return [frames[i] for i in spread(len(frames), _CAMERAS)]
 
 
 @torch.no_grad()
