@@ -6,6 +6,7 @@ import imageio_ffmpeg
 import numpy as np
 import pytest
 
+from forewarp.data import video
 from forewarp.data.video import extracted, stamps_of
 from tests.support.films import numbered, write_film
 
@@ -19,6 +20,16 @@ def test_frames_from_any_time_on_are_those_of_the_whole_video(tmp_path, late):
     assert len(images) == 12
     for n in (0, 5, 11):
         np.testing.assert_array_equal(next(extracted(film, None, None, start=stamps[n] - 0.01)), images[n])
+
+
+@pytest.mark.parametrize("chosen", [[0], [7], [0, 1, 2, 5, 11], [3, 4, 9]])
+@pytest.mark.parametrize("most_told", [100, 0])
+def test_the_frames_that_are_chosen_are_given(tmp_path, monkeypatch, chosen, most_told):
+    """Many are chosen here, as a command has no room for their numbers."""
+    monkeypatch.setattr(video, "_MOST_TOLD", most_told)
+    write_film(tmp_path / "a.mp4", numbered(12, step=20))
+    greys = [int(frame[-1, -1, 0]) for frame in extracted(tmp_path / "a.mp4", chosen, None)]
+    assert greys == pytest.approx([20 * n for n in chosen], abs=4)
 
 
 def test_what_is_no_video_has_no_frames(tmp_path):

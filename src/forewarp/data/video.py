@@ -8,6 +8,7 @@ import subprocess
 from collections.abc import Iterator, Sequence
 from fractions import Fraction
 from functools import lru_cache
+from itertools import islice
 from pathlib import Path
 from threading import Thread
 
@@ -27,6 +28,7 @@ _UNSAID = re.compile(
 _TAGS = re.compile(r"Video: [^,]*, \w+(?:\(([^)]*)\))?, (\d+)x(\d+)")
 _MATRIX = re.compile(r"\b(?<!/)(bt|smpte|fcc|gbr|ycg|ictcp)")
 _INTERLACED = re.compile(r"Video: .*\b(top|bottom) (coded )?first\b")
+_MOST_TOLD = 2000  # frames that ffmpeg is told to choose; a system takes 128 KiB in a word of a command
 _SD = 1024, 576  # pixels of the longer and the shorter side, at most
 # 203 cd/m2 are the white of SDR (BT.2408); below 0.8 of it colours stay, above they are compressed.
 _TO_SDR = (
@@ -56,13 +58,14 @@ def extracted(
     """
 
     def any_of(indices: Sequence[int]) -> str:
-        """Write ``n == a or n == b ...`` as a balanced tree: ffmpeg's parser allows a depth of 100."""
+        """Write ``n == a or n == b ...`` as a tree in which ffmpeg searches for each frame's number."""
         if len(indices) == 1:
             return rf"eq(n\,{indices[0]})"
         half = len(indices) // 2
-        return f"({any_of(indices[:half])}+{any_of(indices[half:])})"
+        return rf"if(lt(n\,{indices[half]})\,{any_of(indices[:half])}\,{any_of(indices[half:])})"
 
-    select = "" if chosen is None else f"select='{any_of(chosen)}',"
+    is_told = chosen is not None and len(chosen) <= _MOST_TOLD
+    select = f"select='{any_of(chosen)}'," if is_told else ""
     filters = f"{deinterlacing(video)}{select}scale=w='iw*sar':h=ih"
     if max(bars) > 0:
         filters += f",crop=w=iw*{1 - 2 * bars[0]}:h=ih*{1 - 2 * bars[1]}"
@@ -72,7 +75,12 @@ def extracted(
     transfer = hdr_of(video)
     filters = "setparams=colorspace=bt709," + filters if _is_untagged_hd(video) else filters
     filters += f",{_TO_SDR.format(transfer)}" if transfer else ""
-    yield from decode(video, f"{filters},format=rgb24", "ppm", Log(), threads, start)
+    frames = decode(video, f"{filters},format=rgb24", "ppm", Log(), threads, start)
+    if chosen is None or is_told:
+        yield from frames
+    else:
+        wanted = {*chosen}
+        yield from (frame for n, frame in enumerate(islice(frames, chosen[-1] + 1)) if n in wanted)
 
 
 def hdr_of(video: Path) -> str | None:
