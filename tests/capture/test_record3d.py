@@ -102,6 +102,7 @@ def test_frames_may_be_fewer_and_have_times_and_lenses_of_their_own(tmp_path):
         ({"poses": []}, "metadata: poses: expected a pose of each frame, but got none"),
         ({"poses": [[0.0] * 7] * 9}, r"poses\[0\]: expected a quaternion of length 1, but got 0"),
         ({"poses": [[0.0] * 6] * 9}, "metadata: poses: expected 7 numbers for each frame, but got"),
+        ({"K": [0.0] * 9}, "metadata: focal length of frame 0: expected above 0, but got 0"),
         ({"K": [1.0]}, r"metadata: K: expected 9 numbers, but got \[1.0\]"),
         ({"dw": None}, "metadata: dw: expected a number"),
         ({"dw": 10**5}, r"metadata: dw: expected a number in \[1, 2048\], but got 100000"),
@@ -124,6 +125,10 @@ def test_what_is_wrong_in_a_scan_is_told_in_a_line(tmp_path, changes, message):
 
 
 def test_another_file_is_no_scan(tmp_path):
+    with zipfile.ZipFile(tmp_path / "nested.r3d", "w") as archive:
+        archive.writestr("metadata", "[" * 100_000)
+    with pytest.raises(SceneError, match="metadata: expected JSON, but got"):
+        captured(tmp_path / "nested.r3d", tmp_path / "a")
     (tmp_path / "a.r3d").write_bytes(b"text")
     with pytest.raises(SceneError, match="expected a scan of Record3D, a ZIP archive, but got another file"):
         captured(tmp_path / "a.r3d", tmp_path / "a")

@@ -102,7 +102,7 @@ class _Scan:
         self.path, self.archive = path, archive
         try:
             about = json.loads(self.member("metadata"))
-        except ValueError as error:  # of its text, too
+        except (ValueError, RecursionError) as error:  # of its text, too; of absurd nesting
             raise mismatch(f"{path}: metadata", "JSON", str(error)) from error
         if not isinstance(about, dict):
             raise mismatch(f"{path}: metadata", "an object", short(about))
@@ -134,6 +134,8 @@ class _Scan:
         pose[:3, :3] = rotations(q[None])[0]
         pose[:3, 3] = torch.tensor(place, dtype=torch.float64)
         fx, fy, cx, cy = self.intrinsics[i]
+        if min(fx, fy) <= 0:
+            raise mismatch(f"{self.path}: metadata: focal length of frame {i}", "above 0", f"{min(fx, fy):g}")
         return Camera(*self.size, fx, fy, cx, cy, opposite(pose[None])[0], 0.0, 1.0)
 
     def depth(self, i: int) -> np.ndarray:
