@@ -41,6 +41,9 @@ def test_windows_begin_from_what_stands_still_and_play_in_one_file(ok, refused, 
     one = str(windows[1])
     assert "1 file" in ok("export", f"run={one}", "format=glb").out
     assert len(forewarp.load(f"{one}/exports/glb/scene.glb").gaussians.means) > 16
+    window = refused("train", *SHORT, *SCENE, "windows=each", "data.window=[0,1]", f"start={one}", "run=more")
+    assert "start: expected a run that begins from images" in window
+    assert window.endswith(f"set start={still.resolve()}")
     other = refused("train", *SHORT, *SCENE, "windows=2", "run=film", "seed=1")
     assert "seed: expected 0, as the run that this folder holds, but got 1" in other
     wrong = refused("train", *SHORT, *SCENE, "start=film/still", "model=forward", "preset=demo")

@@ -115,7 +115,13 @@ def start_of(config: DictConfig) -> Callable[[], tuple[DynamicSceneModule, Hando
     changes = OmegaConf.create({"trust": list(trust_of(config.get("trust")))})
 
     def opened() -> tuple[DynamicSceneModule, Handover]:
-        run = build_run(saved_config(str(config.start), changes, "start"))
+        saved = saved_config(str(config.start), changes, "start")
+        if saved.get("start") is not None:
+            raise ValueError(
+                f"start: expected a run that begins from images, but got {config.start}, which begins from "
+                f"another one; set start={saved.start}"
+            )
+        run = build_run(saved)
         return run.load(), load_handover(run.stage_folder(run.stages[-1]))
 
     return opened

@@ -101,6 +101,18 @@ def test_cameras_that_film_together_at_times_of_their_own_are_asked_together(sti
     assert [frame.moment for frame in asked] == [0, 0]
 
 
+def test_a_window_begins_from_particles_that_stand_still_alone(still):
+    """Times of a window are not those of the film, so that what changes over time would be drawn wrongly."""
+    for before in (
+        module_with(DATA).method,
+        module_with(DATA, **(BARE | {"color_over_time": 2})).method,
+        None,
+    ):
+        with pytest.raises(ValueError, match=r"^start: expected a run of model=particles that stand still"):
+            begun(before)
+    assert begun(still).shared is not None
+
+
 def test_pixels_are_wrong_where_an_image_shows_something_else():
     method = module_with(DATA, **BARE).method
     method.opacity.data.fill_(-9.0)  # nothing is drawn

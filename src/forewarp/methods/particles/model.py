@@ -18,7 +18,7 @@ from forewarp.methods.method import Method, Snapshot, Start, Step
 from forewarp.methods.particles import density, queries
 from forewarp.methods.particles.nodes import Nodes, Skinning, TimeOffsets, are_rows
 from forewarp.methods.particles.options import EFFECTS, Effects, Numbers, ParticlesPlanning, view_share
-from forewarp.methods.particles.shared import begin_window, left_alone
+from forewarp.methods.particles.shared import begin_window, check_still, left_alone
 from forewarp.methods.particles.start import (
     compile_kernels,
     covered_pixels,
@@ -152,8 +152,13 @@ class Particles(Method):
         Also register ``covered_pixels``: mean number of pixels of an image that show anything; ``extent``:
         median distance of points from the middle; and ``final_count``: how many particles there will be,
         beside those that are ``shared``, then of the ``moving_pixels``.
+
+        Raises:
+            ValueError: if the run that a window begins from is not one of particles that stand still.
         """
         moving = 1.0
+        if start.shares and not start.blank:
+            check_still(start.before)
         if isinstance(start.before, Particles):
             before = start.before
             covered, extent = float(before.covered_pixels), float(before.extent)

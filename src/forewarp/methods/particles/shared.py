@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from forewarp.methods.method import Start
+from forewarp.methods.method import Method, Start
 from forewarp.methods.particles.start import first_points, first_values, widths
 from forewarp.ops.grid import dilate
 from forewarp.scene.frame import Frame, Scene, instants_of, sightings, spread
@@ -28,6 +28,22 @@ _MOVES, _NEW = (
 )  # share of a moment's views that show a place wrongly: it moves; a new point is on it
 _POINTS = 4096  # tried on what moves
 _FEW = 16  # particles that are too few to move
+
+
+def check_still(before: Method) -> None:
+    """Refuse a method that no window can begin from: times of a window are not those of another run.
+
+    Raises:
+        ValueError: for one that is not made of particles, or whose particles change over time, unless it is
+            of a window itself.
+    """
+    over_time = ("nodes", "color_over_time", "opacity_over_time")
+    stands = hasattr(before, "shared") and all(getattr(before, name) is None for name in over_time)
+    if not stands and getattr(before, "shared", None) is None:
+        raise ValueError(
+            "start: expected a run of model=particles that stand still, but got one of another kind; make it "
+            "by the same command with windows=still, without data.window and start"
+        )
 
 
 @torch.no_grad()
