@@ -3,6 +3,7 @@
 import copy
 import json
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -112,7 +113,16 @@ def test_what_all_windows_share_is_stored_once(film, written):
     assert int((ids >= 0).sum()) >= int(still[0].sum()) >= facts["shared"]
 
 
-def test_the_page_suffices_to_draw_a_film(film, written, monkeypatch):
+def test_windows_that_began_from_another_run_are_refused(film):
+    """Else those of the first window would be drawn in all."""
+    method = copy.deepcopy(film.later[0].method)
+    method.means.data[method.shared >= 0] += 0.1
+    retrained = replace(film.later[0], module=SimpleNamespace(method=method))
+    with pytest.raises(ValueError, match="^run: expected windows that begin from the same run, but window 2"):
+        shared_in([film, retrained])
+
+
+def test_the_page_suffices_to_draw_a_film(film, written):
     file, _ = written()
     scene = forewarp.load(file)
     assert_alike(PlainScene(file), scene, scene.cameras)

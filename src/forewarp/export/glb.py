@@ -117,6 +117,9 @@ def _told(progress: Progress, before: int, count: int, done: int, _: int) -> Non
 def shared_in(windows: Sequence[Source]) -> list[Tensor | None]:
     """Return which particles (N,) of each window stand still in all of them, the same ones in the same order;
     None of a single window.
+
+    Raises:
+        ValueError: where they are not the same: what stands still was trained again after some windows.
     """
     ids = [window.method.common() if isinstance(window.method, HasCommon) else None for window in windows]
     if len(windows) < 2:
@@ -126,7 +129,15 @@ def shared_in(windows: Sequence[Source]) -> list[Tensor | None]:
     in_all = ids[0][ids[0] >= 0]
     for part in ids[1:]:
         in_all = in_all[torch.isin(in_all, part)]
-    return [torch.isin(part, in_all) for part in ids]
+    shares = [torch.isin(part, in_all) for part in ids]
+    first, *others = (window.method.moving().means.cpu()[share] for window, share in zip(windows, shares))
+    for number, means in enumerate(others, 2):
+        if not torch.equal(first, means):
+            raise ValueError(
+                f"run: expected windows that begin from the same run, but window {number} began from another "
+                "than the first (what stands still was trained again since); train the older windows again"
+            )
+    return shares
 
 
 def rows_of_windows(parts: Sequence[tuple]) -> list[Rows]:
