@@ -98,12 +98,12 @@ def masked_ssim(prediction: Tensor, target: Tensor, mask: Tensor) -> float | Non
     their code gives as well: a number over few pixels is higher than over many.
 
     Returns:
-        None for an image with a side below 11 pixels, as the window does not fit.
+        None for an image with a side below 11 pixels, as the window does not fit, and for an empty mask.
 
     Source: Gao et al., "Monocular Dynamic View Synthesis: A Reality Check" (2022).
     """
     a, b = (x.permute(2, 0, 1) for x in image_pair(prediction, target))
-    if min(a.shape[1:]) < SSIM_LEAST_SIDE:
+    if min(a.shape[1:]) < SSIM_LEAST_SIDE or not bool(mask.any()):
         return None
     means, inside = torch.stack([a, b, a * a, b * b, a * b]), mask.to(a)
     for axis in (-1, -2):
