@@ -71,6 +71,7 @@ def test_numbers_follow_the_images():
             r"stage.fine.opacity_decay: expected a number in \[0, 1\), but got 1",
         ),
         (Numbers, {"jitter": "some"}, "stage.fine.jitter: expected a number >= 0, but got 'some'"),
+        (Numbers, {"shell": 0.5}, "stage.fine.shell: expected 0 or a number >= 1, but got 0.5"),
         (Numbers, {"natural_splines": 1}, "stage.fine.natural_splines: expected true or false, but got 1"),
     ],
 )

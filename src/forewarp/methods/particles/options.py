@@ -105,7 +105,8 @@ class Numbers:
         crowd_decay: extra opacity decay per step, scaled by ``max(0, 1 - covered_pixels / final_count)``.
         rigid_final_factor: factor that the weight of ``rigid`` falls to by the end.
         shell: far planes of the cameras at which particles stand behind all that images show; what is outside
-            the box is at rest. 0: particles begin in the box, and all may move. Images with alpha have none.
+            the box is at rest; at least 1. 0: particles begin in the box, and all may move. Images with alpha
+            have none.
         name: name of the stage.
 
     Raises:
@@ -150,10 +151,11 @@ class Numbers:
             (("edges", "relink"), "a whole number >= 1", lambda value: value >= 1 and value == int(value)),
             (("opacity_decay", "crowd_decay"), "a number in [0, 1)", lambda value: 0 <= value < 1),
             (
-                ("density_until", "rest_from", "jitter", "time_offsets", "shell"),
+                ("density_until", "rest_from", "jitter", "time_offsets"),
                 "a number >= 0",
                 lambda value: value >= 0,
             ),
+            (("shell",), "0 or a number >= 1", lambda value: value == 0 or value >= 1),
         ):
             for key in keys:
                 value = getattr(self, key)
