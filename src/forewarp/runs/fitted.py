@@ -23,6 +23,7 @@ from forewarp.data.batches import COLORS, color_of
 from forewarp.data.checks import blind_frames, bounds
 from forewarp.evaluation.evaluate import evaluate, mean_scores, show
 from forewarp.fields.moving import GaussiansSnapshot, MovingGaussians
+from forewarp.fields.windows import Fading, MovingWindows
 from forewarp.files import read_json, write_json
 from forewarp.glb.reader import read
 from forewarp.methods.method import HasMatter, HasTrajectories, Method, Snapshot
@@ -55,12 +56,12 @@ class Renderable:
         background: (3,), the colour behind the images that it is measured on.
     """
 
-    method: Method | MovingGaussians
+    method: Method | MovingGaussians | MovingWindows
     name: str
     place: Path
     cameras: Sequence[Camera]
     background: Tensor
-    _snapshot: Snapshot | GaussiansSnapshot | None = None
+    _snapshot: Snapshot | GaussiansSnapshot | Fading | None = None
 
     def __repr__(self) -> str:
         """Say in a line what it is and where it came from."""
@@ -231,14 +232,15 @@ class SceneFile(Renderable):
 
     Attributes:
         file: the file.
-        gaussians: all that it holds, moving; ``scene.gaussians.ellipsoids(0.5)`` are they at a time.
+        gaussians: all that it holds, moving; ``scene.gaussians.ellipsoids(0.5)`` are they at a time; of a
+            film in windows its ``MovingWindows``.
         cameras: some of those that the scene was fitted to; a page begins at the first.
         background: (3,), of the images.
         seconds: how long time lasts from 0 to 1, as a player shows it.
     """
 
     file: Path
-    gaussians: MovingGaussians
+    gaussians: MovingGaussians | MovingWindows
     cameras: list[Camera]
     background: Tensor
     seconds: float
@@ -250,8 +252,8 @@ class SceneFile(Renderable):
         return self.file
 
     @property
-    def method(self) -> MovingGaussians:
-        """What renders and moves points."""
+    def method(self) -> MovingGaussians | MovingWindows:
+        """What renders, and moves points where it is not in windows."""
         return self.gaussians
 
 
