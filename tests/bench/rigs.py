@@ -23,7 +23,7 @@ from forewarp.scene.camera import Camera
 from tests.bench.capture import called
 from tests.support.captures import Similarity, pose_errors
 
-TRAIN = ["trainer=cpu", "logger=none", "callbacks.pictures=null", "budget.minutes=null", "threads=1"]
+TRAIN = ["trainer=cpu", "logger=none", "callbacks.pictures=null", "budget.clock=processor", "threads=1"]
 
 
 def truth_of(films: Path) -> tuple[dict[str, Camera], dict[str, float], dict]:
@@ -119,7 +119,7 @@ def main() -> None:
     parser.add_argument("--films", type=Path, required=True)
     parser.add_argument("--out", type=Path, default=Path("runs/rigs"))
     parser.add_argument("--scale", type=int, default=2, help="of the images that are fitted")
-    parser.add_argument("--steps", type=int, default=3000, help="0: compare alone")
+    parser.add_argument("--minutes", type=float, default=10.0, help="of one core, for each fit; 0: none")
     parser.add_argument("--held", default="cam05", help="the camera that is not fitted")
     parser.add_argument("--capture", nargs="*", default=[], help="words for forewarp-capture")
     words = parser.parse_args()
@@ -131,13 +131,13 @@ def main() -> None:
         (words.out / "seconds.json").write_text(json.dumps([spent, time.perf_counter() - begin]))
     facts, similarity = compared(words.films, found)
     facts["seconds"] = json.loads((words.out / "seconds.json").read_text())
-    if words.steps:
+    if words.minutes:
         if not (exact / "transforms.json").exists():
             with_true_poses(words.films, found, exact, similarity, words.scale)
-        steps = f"budget.iterations={words.steps}"
+        minutes = f"budget.minutes={words.minutes}"
         runs = words.out / "runs"
-        facts["found"] = fit(found, runs / "found", words.held, [steps, f"data.scale={words.scale}"])
-        facts["true"] = fit(exact, runs / "true", words.held, [steps, "data.scale=1"])
+        facts["found"] = fit(found, runs / "found", words.held, [minutes, f"data.scale={words.scale}"])
+        facts["true"] = fit(exact, runs / "true", words.held, [minutes, "data.scale=1"])
     (words.out / "facts.json").write_text(json.dumps(facts, indent=2) + "\n")
     print(json.dumps(facts, indent=2))
 
