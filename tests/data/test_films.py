@@ -63,7 +63,7 @@ def test_frames_are_the_same_as_from_memory_and_what_they_take_is_told_before(
     data = data_of(root, tmp_path / ".frames")
     data.setup("fit")
     told = capsys.readouterr().err
-    assert told.startswith("frames  9.22e-06 GB for the decoded frames of cam01.mp4 to cam00.mp4, in ")
+    assert told.startswith("frames  9.22e-06 GB for the decoded frames of 2 films, in ")
     assert f"frames 100% | {2 * COUNT}/{2 * COUNT} in 0:0" in told.splitlines()[-1]
     assert "assumed" not in data.scene.protocol
     frames = [*data.scene.train, *data.scene.test]
@@ -151,9 +151,7 @@ def test_a_file_that_was_cut_off_or_removed_is_made_again(film, tmp_path):
 
 def test_too_little_room_is_refused_in_a_line_and_nothing_is_written(film, tmp_path, monkeypatch):
     store = FilmStore(tmp_path, BYTES - 1)
-    match = (
-        r"data.disk_cache_bytes: expected at least 4.61e-06 GB for the decoded .* cam00.mp4, but got 4.61e"
-    )
+    match = rf"disk_cache_bytes: expected at least {BYTES} .* of 1 film.*, but got {BYTES - 1};"
     with pytest.raises(SceneError, match=match) as caught:
         store.fill([film])
     assert "raise it, set a larger data.scale or fewer data.frames, or 0 to seek" in str(caught.value)

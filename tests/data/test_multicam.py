@@ -229,10 +229,10 @@ def test_a_harmed_rig_is_refused_in_a_line(folder, harm, match):
         ({"frames": 0}, "data.frames: expected a whole number of at least 1, but got 0"),
         (
             {"test_cameras": ["cam07"]},
-            r"data.test_cameras: .* cameras of cam00, cam01, cam02, not all, but got \['cam07'\]",
+            r"data.test_cameras: expected some of .* cam00, cam01, cam02, not all, but got no camera cam07",
         ),
-        ({"test_cameras": "cam00"}, "data.test_cameras: expected different cameras"),
-        ({"test_cameras": ["cam00", "cam01", "cam02"]}, "data.test_cameras: .* not all"),
+        ({"test_cameras": "cam00"}, "data.test_cameras: expected some of the cameras"),
+        ({"test_cameras": ["cam00", "cam01", "cam02"]}, "data.test_cameras: expected some of the cameras"),
         (
             {"test_cameras": []},
             "expected a camera or a moment to test on, but got none; name some in data.test",
@@ -261,7 +261,9 @@ def test_poses_in_other_axes_are_named(tmp_path):
 
 
 def test_names_of_many_cameras_are_shortened():
-    with pytest.raises(SceneError, match="different cameras of cam00, cam01 .. cam19, not all"):
+    with pytest.raises(
+        SceneError, match="some of the cameras cam00, cam01 .. cam19, not all, but got no camera x"
+    ):
         held_cameras(["x"], [f"cam{k:02d}" for k in range(20)], [])
 
 

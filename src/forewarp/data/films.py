@@ -220,14 +220,13 @@ class FilmStore:
             if (taken + needed > self.limit or needed > free) and time.time() - used > _IN_USE_S:
                 path.unlink(missing_ok=True)
                 taken, free = taken - size, free + size
-        what = f"{needed / 1e9:.3g} GB for the decoded frames of {names[0]}"
-        what += f" to {names[-1]}" if len(names) > 1 else ""
+        what = f"{needed / 1e9:.3g} GB for the decoded frames of {len(names)} film" + "s" * (len(names) > 1)
         fewer = "set a larger data.scale or fewer data.frames"
         if taken + needed > self.limit:
             others = f", {taken / 1e9:.3g} GB of it in use" if taken else ""
             advice = f"raise it, {fewer}, or 0 to seek each frame in its film, which takes seconds"
-            got = f"{self.limit / 1e9:.3g} GB{others}"
-            raise mismatch("data.disk_cache_bytes", f"at least {what}", got, advice)
+            least = f"at least {taken + needed} ({what})"
+            raise mismatch("data.disk_cache_bytes", least, f"{self.limit}{others}", advice)
         if needed > free:
             got = f"{max(free, 0) / 1e9:.3g} GB free"
             raise mismatch(folder, what, got, f"{fewer}, or run=<a folder on a larger disk>")

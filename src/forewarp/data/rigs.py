@@ -34,7 +34,9 @@ def held_cameras(
     texts = [str(name) for name in wanted] if are_names else [""]
     if not {*texts} <= {*names} or len({*texts}) < len(texts) or len(texts) >= len(names):
         there = ", ".join(names) if len(names) <= _SHOWN else f"{names[0]}, {names[1]} .. {names[-1]}"
-        raise mismatch("data.test_cameras", f"different cameras of {there}, not all", short(wanted))
+        unknown = [text for text in texts if text and text not in names]
+        got = f"no camera {unknown[0]}" if unknown else short(wanted)
+        raise mismatch("data.test_cameras", f"some of the cameras {there}, not all", got)
     return sorted(names.index(text) for text in texts)
 
 

@@ -34,7 +34,7 @@ from forewarp.ops.nodes import carry_nodes, pull_nodes, skin_weights, spread_nod
 from forewarp.scene.box import Box, Lattice
 from forewarp.scene.camera import Camera, Lens, Rays
 from forewarp.scene.cloud import Cloud, nearest
-from forewarp.scene.frame import Frame, Scene, spread, visual_hull
+from forewarp.scene.frame import Frame, Scene, instants_of, spread, visual_hull
 
 _FRAMES = 12  # whose silhouettes carve the hull
 _DRIFT = 0.2  # share of an image's width by which a silhouette is taken to move in all the time there is
@@ -47,7 +47,7 @@ _WHOLLY = 0.999  # share of a pixel from which on all of it is learned from
 _SIDE = 64  # lattice points along the longer side of an image
 _SWEPT, _NEIGHBOURS = 10, 8  # images that are swept; neighbours in time of each
 _DOUBT = 0.02  # of full scale, by which colours must be more alike where no plane was expected
-_SHELLED = 24  # images without a hole once points lie behind all
+_SHELLED, _COARSER = 24, 4  # images without a hole once points lie behind all; how much larger a hole is
 _NEAREST_PLANE = 0.02  # share of the far plane at which planes begin at the earliest
 
 _MEASURED = 32  # images whose measured depths are looked at
@@ -258,16 +258,20 @@ def swept(scene: Scene, frames: list[int], count: int, shell: float = 0.0) -> Cl
     points, colors, sizes = [still], [seen_colors(still, cameras, images)], []
     small = cache(partial(_small, scene.train, side))
     low, high = torch.tensor(scene.box.low), torch.tensor(scene.box.high)
+    middle = (low + high) / 2
     for beyond in (1.0,) if shell == 0 else (1.0, shell):  # what lies in the box goes first in all images
         for i in chosen:
             new, color, size = _sweep(scene, i, side, small, torch.cat(points), beyond)
-            fills = ((new >= low) & (new <= high)).all(-1) | (beyond > 1)
+            fills = ((new >= low) & (new <= high)).all(-1)
+            if beyond > 1:  # before the box is what only seems to be there
+                center = scene.train[i].camera.center.to(new)
+                fills = ~fills & ((new - center).norm(dim=-1) > (middle - center).norm())
             points.append(new[fills])
             colors.append(color[fills])
             sizes += [size] if beyond == 1 else []
     if shell > 0:
         for i in spread(len(scene.train), _SHELLED):
-            new, color = _behind(small(i), side, torch.cat(points), shell)
+            new, color = _behind(small(i), max(4, side // _COARSER), torch.cat(points), shell)
             points.append(new)
             colors.append(color)
     points, colors = torch.cat(points), torch.cat(colors)
@@ -323,11 +327,7 @@ def _sweep(
     """
     rays, color, step = _holes(small(i), side, before)
     camera = small(i)[2]
-    time = scene.train[i].time
-    neighbours = sorted(
-        (j for j in range(len(scene.train)) if j != i),
-        key=lambda j: (abs(scene.train[j].time - time), abs(j - i)),
-    )[:_NEIGHBOURS]
+    neighbours = _neighbours(scene, i)
     near = _nearest_plane(camera, [scene.train[j].camera for j in neighbours])
     depths = 1 / torch.linspace(1 / near, 1 / (beyond * camera.far), _DEPTHS)
     points = rays.origins[:, None] + depths[:, None] * rays.directions[:, None]  # (P, D, 3)
@@ -337,6 +337,14 @@ def _sweep(
     depth = depths[best_half.argmin(-1)]
     points, size = rays.origins + depth[:, None] * rays.directions, depth.median() * step / camera.fx
     return points, color, size
+
+
+def _neighbours(scene: Scene, i: int) -> list[int]:
+    """Choose the images nearest in time to one; of an instant, those whose cameras are nearest."""
+    times = instants_of(scene.train)
+    away = [float((frame.camera.center - scene.train[i].camera.center).norm()) for frame in scene.train]
+    others = (j for j in range(len(times)) if j != i)
+    return sorted(others, key=lambda j: (abs(times[j] - times[i]), away[j], abs(j - i)))[:_NEIGHBOURS]
 
 
 def _behind(image: tuple[Tensor, Tensor, Camera], side: int, before: Tensor, shell: float):
