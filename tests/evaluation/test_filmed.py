@@ -32,6 +32,16 @@ def test_what_a_training_image_shows_stays_and_the_rest_fades():
     assert fade.kept(drawn_at(behind, 2.0), behind).max() == 0
 
 
+def test_what_was_filmed_from_other_sides_alone_fades():
+    camera = camera_at(0.0, size=40)
+    fade = Fade([camera])
+    cameras = [camera_at(turn, size=40) for turn in (0.0, 0.05, 0.12, 0.2, 0.5)]  # of a circle
+    kept = [fade.kept(drawn_at(one, float(one.center.norm())), one)[20, 20] for one in cameras]
+    assert kept[0] == kept[1] == 1
+    assert 0 < kept[2] < 1
+    assert kept[3] == kept[4] == 0
+
+
 def test_where_nothing_is_the_far_plane_counts():
     """What is seen from elsewhere at a small distance may still be filmed far away."""
     filmed = replace(camera_at(0.6, size=40), far=100.0)

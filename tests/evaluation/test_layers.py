@@ -1,5 +1,6 @@
 """What moves of a fitted scene, against the truth of the procedural ones."""
 
+from statistics import fmean
 from types import SimpleNamespace
 
 import imageio.v3 as iio
@@ -9,6 +10,7 @@ import torch
 from omegaconf import OmegaConf
 
 from forewarp.cli.render import write_film
+from forewarp.evaluation.evaluate import over_scene
 from forewarp.evaluation.images import moving_share
 from forewarp.evaluation.layers import layer_of
 from tests.bench.layers import score
@@ -64,3 +66,28 @@ def test_the_mask_of_what_moves_is_that_of_the_scene_itself(ok, tmp_path):
     budget = ["budget.minutes=null", "budget.iterations=2000", "trainer=cpu", "threads=1"]
     ok("train", "scene=specimen_rigid", "model=particles", *words, *budget, f"run={tmp_path}/run")
     assert score(tmp_path / "run") >= 0.86
+
+
+def test_how_much_faster_the_camera_goes_than_what_moves():
+    """Half of the particles go along x by 1 in all; cameras of a film go around them."""
+    count, scene = 10, DATA.scene
+
+    class Known:
+        def in_motion(self, frames):
+            return torch.arange(count) < count // 2
+
+        def only(self, rows): ...
+
+        def template(self): ...
+
+        def movement(self, times): ...
+
+        def ellipsoids(self, time):
+            return SimpleNamespace(centers=torch.tensor([time, 0.0, 0.0]).expand(count, 3))
+
+    frames = scene.train
+    steps = [float((b.camera.center - a.camera.center).norm()) for a, b in zip(frames, frames[1:])]
+    known, still = (SimpleNamespace(method=made()) for made in (Known, object))
+    said = over_scene(known, scene)["camera_over_scene"]
+    assert said.startswith(f"{fmean(steps) * (len(frames) - 1):.2g} times as fast as what moves")
+    assert over_scene(still, scene) == {}

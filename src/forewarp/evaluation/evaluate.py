@@ -21,7 +21,7 @@ from forewarp.clock import now
 from forewarp.drawing.images import at_least, error_colors, in_a_row, write_png
 from forewarp.files import write_json
 from forewarp.methods.effect import switched
-from forewarp.methods.method import CarriesPixels, HasTrajectories, parameter_count
+from forewarp.methods.method import CarriesPixels, HasEllipsoids, HasLayers, HasTrajectories, parameter_count
 from forewarp.metrics.geometry import end_point_error
 from forewarp.metrics.registry import METRICS, ImageSuite, scores_of_parts, summarise
 from forewarp.ops.grid import block_means, reduced_depth
@@ -31,6 +31,7 @@ from forewarp.scene.view import Moment, Rendering, Target, View
 from forewarp.training.module import DynamicSceneModule
 
 FAMILIES = ("lpips", "mlpips", "ms_ssim", "depth")
+_PAIRS = 24  # of images, between which motion is looked at
 PCK = 0.05  # of an image's longer side, within which a keypoint is where it should be
 _SHEET_SIDE = 300  # least pixels of the shorter side of an image on a sheet
 _LEAST_ALPHA = 0.5 / 255  # 8 bits round it to 0, where stored colours are 0 too
@@ -149,6 +150,7 @@ def evaluate(
             "scene": scene.name,
             **scene.protocol,
             **from_training(scene),
+            **over_scene(module, scene),
             **protocol,
             **module.method.protocol(),
             "renderings": [*others, best],
@@ -201,7 +203,7 @@ def from_training(scene: Scene) -> dict[str, str]:
 
     >>> from types import SimpleNamespace as Of
     >>> train, test = ([Of(time=t) for t in times] for times in ((0.0, 0.2, 0.3, 0.3), (0.1, 0.4, 0.45)))
-    >>> from_training(Of(train=train, test=test, protocol={"seconds": 5.0}, times=(0.0, 0.2, 0.3)))
+    >>> from_training(Of(train=train, test=test, protocol={"seconds": 5.0}, instants=(0.0, 0.2, 0.3)))
     {'nearest_training_frame': '1 to 1.5 steps of 0.5 s'}
     """
     train, test = ([frame.time for frame in frames] for frames in (scene.train, scene.test))
@@ -217,6 +219,31 @@ def from_training(scene: Scene) -> dict[str, str]:
     if walk is not None and walk[1] is not None:
         told["camera_motion"] = f"{walk[1]:.3g} degrees a second (omega), {walk[0]:.3g} in all"
     return told
+
+
+@torch.no_grad()
+def over_scene(module: DynamicSceneModule, scene: Scene) -> dict[str, str]:
+    """Say how many times as fast as what moves the camera of a film goes, by the learned motion; {} for
+    several cameras, and for methods that do not tell what moves.
+
+    Source: Gao et al., "Monocular Dynamic View Synthesis: A Reality Check" (2022), the full effective
+    multi-view factor; here the mean over pairs of images one after the other.
+    """
+    method, frames = module.method, sorted(scene.train, key=lambda frame: frame.time)
+    if walk_of(scene) is None or not (isinstance(method, HasLayers) and isinstance(method, HasEllipsoids)):
+        return {}
+    rows = method.in_motion(scene.train)
+    ratios = []
+    for i in spread(len(frames) - 1, _PAIRS):
+        first, second = frames[i], frames[i + 1]
+        before, after = (method.ellipsoids(frame.time).centers[rows] for frame in (first, second))
+        went = float((after - before).norm(dim=-1).mean()) if bool(rows.any()) else 0.0
+        if went > 0:
+            ratios.append(float((second.camera.center - first.camera.center).norm()) / went)
+    if not ratios:
+        return {}
+    of = "times as fast as what moves (Omega, by the learned motion)"
+    return {"camera_over_scene": f"{fmean(ratios):.2g} {of}"}
 
 
 def mean_scores(module: DynamicSceneModule, targets: Sequence[Target], suite: ImageSuite) -> dict[str, float]:

@@ -1,4 +1,4 @@
-"""Let images fade where they leave what was filmed: beyond the edges of all training images."""
+"""Let images fade where they leave what was filmed: beyond all images' edges, and seen from other sides."""
 
 from __future__ import annotations
 
@@ -15,14 +15,16 @@ from forewarp.scene.view import Rendering, View
 _CAMERAS = 48  # training cameras that are asked
 _STEP = 4  # pixels between two places that are looked at
 _MARGIN = 0.1  # share of a training image's longer side, outside of which nothing is left
+_BESIDE, _ASIDE = 30.0, 60.0  # degrees from the nearest camera's direction: all is left, nothing
 _TOLD = 0.01  # share of an image from which on it counts as faded
 
 
 class Fade:
     """Paint over an image what no training camera has in its view; see ``evaluation.images.video``.
 
-    A pixel fades to black within a tenth of a training image beyond its edge. That something stood before it
-    in all training images is not noticed. ``shares`` has the share of each painted image that is faded.
+    A pixel fades to black within a tenth of a training image beyond its edge, and from 30 to 60 degrees
+    beside the directions from which training cameras saw the place. That something stood before it in all of
+    them is not noticed. ``shares`` has the share of each painted image that is faded.
 
     Args:
         cameras: of training; some are asked where there are many.
@@ -53,7 +55,11 @@ class Fade:
             places, ahead = filmed.project(points)
             size = torch.tensor([filmed.width, filmed.height]).to(places)
             outside = torch.maximum(-places, places - size).amax(-1) / (_MARGIN * float(size.max()))
-            kept = torch.maximum(kept, torch.where(ahead > 0, (1 - outside).clamp(0, 1), 0.0).float())
+            towards = torch.nn.functional.normalize(points - filmed.center.to(points), dim=-1)
+            cosine = (towards * rays.directions).sum(-1).clamp(-1, 1)
+            beside = (torch.rad2deg(torch.acos(cosine)) - _BESIDE) / (_ASIDE - _BESIDE)
+            shown = (1 - outside).clamp(0, 1) * (1 - beside).clamp(0, 1)
+            kept = torch.maximum(kept, torch.where(ahead > 0, shown, 0.0).float())
         kept = kept.reshape(1, 1, len(rows), len(columns))
         return interpolate(kept, shape, mode="bilinear", align_corners=False)[0, 0]
 
