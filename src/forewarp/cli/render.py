@@ -5,7 +5,7 @@ forewarp-render makes a video of a finished run, into its videos/.
   forewarp-render run=runs/hand/particles-fast-seed0 path=swing      a capture, filmed from one side
   forewarp-render run=FOLDER path=trajectories format=gif size=300
 
-Of a film, what no training image shows fades to black, and how much did is said.
+Of a film, what no training image shows, or only from other sides, fades to black; how much did is said.
 
 What one types most:
   run=FOLDER                    the run (needed)
