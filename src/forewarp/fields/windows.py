@@ -113,7 +113,7 @@ class MovingWindows:
         return window.gaussians.ellipsoids(window.time(time))
 
 
-def joined(own: MovingGaussians, still: MovingGaussians) -> MovingGaussians:
+def with_shared(own: MovingGaussians, still: MovingGaussians) -> MovingGaussians:
     """Return Gaussians, and after them others that stand ``still``, of as many coefficients."""
 
     def rows(name: str) -> Tensor | None:

@@ -14,7 +14,7 @@ import torch
 
 from forewarp.fields.curves import KINDS, PADDING, Curve
 from forewarp.fields.moving import MARGIN, MovingGaussians, NodeMotion
-from forewarp.fields.windows import MovingWindows, Window, check_windows, joined, taken
+from forewarp.fields.windows import MovingWindows, Window, check_windows, taken, with_shared
 from forewarp.files import MOST_CONFIG, read_bytes
 from forewarp.glb import meshopt
 from forewarp.glb.container import CHUNKS, COMPONENTS, COMPRESSION, ELEMENTS, MAGIC, VERSION
@@ -305,7 +305,7 @@ def _windows(container: Container, first: MovingGaussians, motion: Fields) -> Mo
         own = _gaussians(container, primitive.part("attributes"), splats.part("extensions").part(MOTION))
         if _coefficients(own) != _coefficients(shared):
             raise ValueError(f"{part.place}: expected as many coefficients as the first window has")
-        gaussians.append(joined(own, shared))
+        gaussians.append(with_shared(own, shared))
     return MovingWindows(tuple(map(Window, gaussians, spans, begins)), fade)
 
 

@@ -203,9 +203,9 @@ def test_what_is_beyond_the_box_rests_without_a_node_and_may_be_large():
     assert torch.equal(method.resting, beyond)
     assert not bool(method.beyond(method.nodes.positions).any())
     method.scales.data[beyond] = math.log(0.5 * float(method.extent))
-    method.gradient_sum += 1.0
-    method.image_count += 1.0
     for number in range(1, 4):
+        method.gradient_sum.copy_(method.beyond(method.means.data).float() + 1.0)
+        method.image_count.fill_(1.0)
         method.advance(0.1 * number, number, optimizer)
     assert bool(method.resting[method.beyond(method.means.data)].all())
     assert int(method.resting.sum()) > int(beyond.sum())  # split, not removed
