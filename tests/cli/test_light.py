@@ -56,7 +56,7 @@ REFUSED = [
     (["export", "run=."], "config.yaml: expected the configuration of a run, but got none"),
     (["report", "kind=run", "run=a"], "config.yaml: expected the configuration of a run, but got none"),
     (["report"], "runs/accuracy_time: expected folders of runs, but got none"),
-    (["capture"], "expected video=FILE or images=FOLDER, but got neither"),
+    (["capture"], "expected video=FILE, videos=FOLDER or images=FOLDER, but got none"),
     (["synthesize", "folder=."], "expected a new or empty folder, but got one with files"),
 ]
 
