@@ -223,21 +223,23 @@ def from_training(scene: Scene) -> dict[str, str]:
 
 @torch.no_grad()
 def over_scene(module: DynamicSceneModule, scene: Scene) -> dict[str, str]:
-    """Say how many times as fast as what moves the camera of a film goes, by the learned motion; {} for
-    several cameras, and for methods that do not tell what moves.
+    """Say how many times as fast as what moves the camera of a film goes, by the learned motion; {} where
+    there is no film of one camera (``walk_of`` knows no speed), and for methods that do not tell what moves.
 
     Source: Gao et al., "Monocular Dynamic View Synthesis: A Reality Check" (2022), the full effective
     multi-view factor; here the mean over pairs of images one after the other.
     """
     method, frames = module.method, sorted(scene.train, key=lambda frame: frame.time)
-    if walk_of(scene) is None or not (isinstance(method, HasLayers) and isinstance(method, HasEllipsoids)):
+    walk, tells = walk_of(scene), isinstance(method, HasLayers) and isinstance(method, HasEllipsoids)
+    if walk is None or walk[1] is None or not tells:
         return {}
-    rows = method.in_motion(scene.train)
-    ratios = []
+    rows, ratios = method.in_motion(scene.train), []
+    if not bool(rows.any()):
+        return {}
     for i in spread(len(frames) - 1, _PAIRS):
         first, second = frames[i], frames[i + 1]
         before, after = (method.ellipsoids(frame.time).centers[rows] for frame in (first, second))
-        went = float((after - before).norm(dim=-1).mean()) if bool(rows.any()) else 0.0
+        went = float((after - before).norm(dim=-1).mean())
         if went > 0:
             ratios.append(float((second.camera.center - first.camera.center).norm()) / went)
     if not ratios:
