@@ -348,3 +348,21 @@ def test_steps_and_a_picture_stay_on_their_device(scenes, name):
         with torch.no_grad():
             drawn = method.at(Moment(0.5)).render(View(data.scene.train[0].camera), torch.ones(3).to("cuda"))
         assert {part.device for part in vars(drawn).values()} == {GPU}
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no GPU")
+@pytest.mark.parametrize("name", METHODS)
+def test_a_gpu_takes_the_step_that_the_cpu_takes(name, scenes, monkeypatch):
+    monkeypatch.setattr(torch.backends.cudnn, "allow_tf32", False)
+    data, batch, found = data_of("dnerf", scenes), None, []
+    for place in ("cpu", "cuda"):
+        module = module_of(METHODS[name], data)
+        batch = batch or batch_of(data)
+        module.method.to(place)
+        gradients = gradients_of(module, batch.to(place))
+        found.append((module.last["loss"], {name: g.cpu().double() for name, g in gradients.items()}))
+    (loss, here), (theirs, there) = found
+    assert theirs == pytest.approx(loss, rel=1e-4)
+    assert here.keys() == there.keys()
+    for part, gradient in here.items():  # float32, and sums in another order
+        assert (there[part] - gradient).norm() <= 0.01 * gradient.norm() + 1e-7, part
