@@ -201,7 +201,7 @@ def test_methods_are_compared_over_lengths(tmp_path, monkeypatch):
     assert rows_of(text, "method")[0][1:] == ["2 s", "1 min", "5 min", "seeds", "passed by `particles` after"]
     assert rows_of(text, "`particles`")[0][1:] == ["21.00 ± 1.41", "30.00", "33.00", "2, 1, 1", ""]
     assert rows_of(text, "`forward`")[0][1:] == ["19.00", "24.00", "29.50", "1, 1, 1", "1 min"]
-    assert "* Other: 31 dB after 600 s of an RTX 1 (dnerf; its paper)" in text
+    assert "| Other | 31 | 600 s | RTX 1 | dnerf | its paper |" in text
     assert ("Toy" in text, beside) == (False, [[OTHER]])  # of no scene's dataset
     assert (out / "accuracy-time-ball.png") in written
     assert "](accuracy-time-ball.png)" in text

@@ -163,7 +163,7 @@ def test_pages_tell_how_numbers_came_about(whole):
         "* protocol 1: dnerf, 4x3, background white",
         "* machine: a cpu, 2 threads, torch 2",
         "* budget: fast, 1 min a run",
-        "* Table 3: NHR: no measured row",
+        "* no measured row: Table 2, Table 3, Table 4, ",
         "* Table 1: T-NeRF's printed mean PSNR is 29.51; its printed scenes average 28.78",
         "* ball/failed-1.0-seed0: no metrics.json; run its command again",
         "](accuracy-time-hook.png)",

@@ -374,7 +374,8 @@ def write_paper(folder: Path, out: Path, published: Path = PAPER, curves: Path |
             title = f"{table.title}: synthetic counterpart"
             tables.append(Section(title, [shown], facts(of_made, numbers)))
             files.append(out / f"paper-{name}-counterpart.csv")
-        left_out += [] if of_real or of_made else [f"{table.title}: no measured row"]
+    if absent := [table.title.split(":")[0] for table, kinds in shown_runs.items() if not any(kinds)]:
+        left_out.append(f"no measured row: {', '.join(absent)}")
     for section, file in zip(tables, files):
         replace_file(file, section.tables[0].csv() + "".join(f"# {line}\n" for line in section.facts))
     drawn = _figures(runs, out, curves)
