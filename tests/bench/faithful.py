@@ -3,12 +3,14 @@
 Writes the table of docs/results/faithful-step.md and the CSV beside it. ``--scene FOLDER`` takes a D-NeRF
 scene in place of the procedural vehicle. Each method has a process of its own, one after the other; one that
 does not fit into ``--gib`` is measured with half the rays, a quarter, and so on; ``--only`` measures some.
+``--device cuda`` measures on a GPU, in one process, for a table and a CSV file of their own.
 """
 
 from __future__ import annotations
 
 import argparse
 import csv
+import gc
 import io
 import json
 import resource
@@ -26,6 +28,7 @@ from omegaconf import DictConfig
 from torch.utils.flop_counter import FlopCounterMode
 
 from forewarp.cli.entry import quiet
+from forewarp.clock import now
 from forewarp.evaluation.evaluate import device_name
 from forewarp.files import read_rows, replace_file
 from forewarp.methods.method import parameter_count
@@ -45,15 +48,16 @@ METHODS += ("ndvg", "tineuvox_s", "tineuvox_b")
 FIELDS = ("method", "of", "rays", "flop", "seconds", "bytes", "parameters", "steps", "failed")
 CONDITIONS = ("scene", "day")
 LEAST = 64  # rays
+TIMED = {"cpu": 1, "cuda": 3}  # steps
 
 
-def configured(method: str, scene: Path, rays: int | None = None) -> DictConfig:
+def configured(method: str, scene: Path, rays: int | None = None, device: str = "cpu") -> DictConfig:
     """Compose the config of a method with its published numbers, or with so many rays a step."""
     words = [
         "experiment=dnerf",
         f"model={method}",
         "preset=faithful",
-        "trainer=cpu",
+        "trainer=cpu" if device == "cpu" else "trainer=gpu",
         "threads=1",
         "logger=none",
     ]
@@ -61,25 +65,27 @@ def configured(method: str, scene: Path, rays: int | None = None) -> DictConfig:
     return composed(*words, f"data.root={scene.parent}", f"data.scene={scene.name}")
 
 
-def measured(method: str, scene: Path, rays: int | None = None) -> dict:
-    """Take two steps of the last stage, at the end of its schedule: count the first, time the second.
+def measured(method: str, scene: Path, rays: int | None = None, device: str = "cpu") -> dict:
+    """Take steps of the last stage, at the end of its schedule: count the first, time those that follow.
 
     Args:
         method: a ``model=``.
         scene: folder of a D-NeRF scene.
         rays: a step; None: as published.
+        device: cpu or cuda.
 
     Returns:
-        ``FIELDS``: rays published and taken, FLOP, seconds of processor time, peak bytes beyond what the
-        process held before, parameters, and the steps of all stages.
+        ``FIELDS``: rays published and taken, FLOP, seconds of a step (processor time, or the wall clock's
+        until a GPU has finished), peak bytes beyond what the process held before (or of the GPU),
+        parameters, and the steps of all stages.
     """
     torch.set_num_threads(1)
-    run = build_run(configured(method, scene, rays))
+    run = build_run(configured(method, scene, rays, device))
     run.datamodule.setup("fit")
     torch.manual_seed(0)
     reset_peak_memory()
-    before = peak_memory_bytes()
-    module = run._module(run.stages[-1])
+    before = peak_memory_bytes() if device == "cpu" else 0
+    module = run._module(run.stages[-1]).to(device)
     module.method.warm_up()
     optimizer = module.configure_optimizers()
     counter = FlopCounterMode(display=False)
@@ -87,14 +93,17 @@ def measured(method: str, scene: Path, rays: int | None = None) -> dict:
     counter.mod_tracker = SimpleNamespace(parents={"Global"}, __enter__=int, __exit__=int)
     with counter:
         taken = stepped(run, module, optimizer)
-    begun = time.process_time()
-    stepped(run, module, optimizer)
+    clock = "processor" if device == "cpu" else "wall"
+    begun = now(clock)
+    for _ in range(TIMED[device]):
+        stepped(run, module, optimizer)
+    seconds = (now(clock) - begun) / TIMED[device]
     return {
         "method": method,
         "of": configured(method, scene).preset.rays,
         "rays": taken,
         "flop": counter.get_total_flops(),
-        "seconds": time.process_time() - begun,
+        "seconds": seconds,
         "bytes": peak_memory_bytes() - before,
         "parameters": parameter_count(module.method),
         "steps": sum(stage.settings.iterations for stage in run.stages),
@@ -108,7 +117,7 @@ def stepped(run: Run, module: DynamicSceneModule, optimizer: torch.optim.Optimiz
     run.datamodule.picker, run.datamodule.asks = module.curriculum, module.method.asks
     last = module.settings.iterations - 1
     module.method.advance(1.0, last, optimizer)
-    batch = run.datamodule.batches.draw()
+    batch = run.datamodule.batches.draw().to(module.device)
     optimizer.zero_grad()
     factors = module.objective.factors(0)  # every term, also those that count in every tenth step alone
     step = module.look(batch, factors)
@@ -118,6 +127,19 @@ def stepped(run: Run, module: DynamicSceneModule, optimizer: torch.optim.Optimiz
         set_gradients(module.method, step.gradients)
     optimizer.step()
     return sum(len(seen.view) for seen in batch.observations)
+
+
+def on_gpu(method: str, scene: Path) -> dict:
+    """Measure on a GPU, in this process, as its memory is freed between methods."""
+    why = ""
+    try:
+        return measured(method, scene, device="cuda")
+    except (RuntimeError, ValueError) as error:
+        why = str(error).split("\n")[0]
+    finally:
+        gc.collect()
+        torch.cuda.empty_cache()
+    return dict.fromkeys(FIELDS) | {"method": method, "failed": why}
 
 
 def apart(method: str, scene: Path, gib: float) -> dict:
@@ -138,11 +160,12 @@ def apart(method: str, scene: Path, gib: float) -> dict:
     return dict.fromkeys(FIELDS) | {"method": method, "failed": why}
 
 
-def steps_table(rows: Sequence[dict]) -> str:
+def steps_table(rows: Sequence[dict], device: str = "cpu") -> str:
     """Make the Markdown table; a method that failed has its reason in place of numbers.
 
     FLOP and seconds of a step with fewer rays than published are multiplied accordingly, and marked so.
     """
+    digits = 1 if device == "cpu" else 3
     head = ["method", "rays", "GFLOP", "MFLOP a ray", "s", "GiB", "parameters (M)", "steps", "days for all"]
     lines = []
     for row in rows:
@@ -156,7 +179,7 @@ def steps_table(rows: Sequence[dict]) -> str:
             f"{row['of']:,}" if whole else f"{row['of']:,}, measured with {row['rays']:,}",
             f"{about}{row['flop'] * times / 1e9:,.0f}",
             f"{row['flop'] / 1e6 / row['rays']:,.1f}",
-            f"{about}{seconds:.1f}",
+            f"{about}{seconds:.{digits}f}",
             f"{row['bytes'] / 2**30:.1f}" + ("" if whole else f" with {row['rays']:,}"),
             f"{row['parameters'] / 1e6:.2f}",
             f"{row['steps']:,}",
@@ -177,16 +200,22 @@ def known_rows(file: Path) -> list[dict]:
     ]
 
 
-def write(rows: Sequence[dict], page: Path) -> None:
+def table_file(page: Path, device: str) -> Path:
+    """Return the CSV file of a page's table."""
+    return page.with_suffix(".csv") if device == "cpu" else page.with_name(f"{page.stem}-gpu.csv")
+
+
+def write(rows: Sequence[dict], page: Path, device: str = "cpu") -> None:
     """Write the table into the page, and a CSV file beside it."""
     scene, day = (" and ".join(sorted({row[name] for row in rows})) for name in CONDITIONS)
-    about = f"Scene: {scene}. Machine: {device_name(torch.device('cpu'))}, one thread, {day}."
-    replace_section(page, "steps", f"{about}\n\n{steps_table(rows)}")
+    about = f"Scene: {scene}. Machine: {device_name(torch.device(device))}, one thread, {day}."
+    section = "steps" if device == "cpu" else "steps on a GPU"
+    replace_section(page, section, f"{about}\n\n{steps_table(rows, device)}")
     file = io.StringIO()
     writer = csv.DictWriter(file, (*FIELDS, *CONDITIONS), lineterminator="\n")
     writer.writeheader()
     writer.writerows(rows)
-    replace_file(page.with_suffix(".csv"), file.getvalue())
+    replace_file(table_file(page, device), file.getvalue())
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -195,6 +224,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--scene", type=Path, help="folder of a D-NeRF scene")
     parser.add_argument("--only", nargs="*", default=METHODS)
     parser.add_argument("--gib", type=float, default=12.0, help="most memory of a method")
+    parser.add_argument("--device", choices=list(TIMED), default="cpu")
     parser.add_argument("--page", type=Path, default=project_root() / PAGE)
     parser.add_argument("--one", help=argparse.SUPPRESS)
     parser.add_argument("--rays", type=int, help=argparse.SUPPRESS)
@@ -205,7 +235,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         resource.setrlimit(resource.RLIMIT_DATA, (int(given.gib * 2**30), hard))
         print(json.dumps(measured(given.one, given.scene.resolve(), given.rays)))
         return
-    rows = {row["method"]: row for row in known_rows(given.page.with_suffix(".csv"))}
+    rows = {row["method"]: row for row in known_rows(table_file(given.page, given.device))}
     with tempfile.TemporaryDirectory() as folder:
         scene = given.scene.resolve() if given.scene else synthesize(Path(folder) / "vehicle")
         if others := {row["scene"] for row in rows.values()} - {scene.name}:
@@ -214,9 +244,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
             )
         for method in given.only:
             about = {"scene": scene.name, "day": time.strftime("%Y-%m-%d")}
-            rows[method] = apart(method, scene, given.gib) | about
+            here = given.device == "cpu"
+            rows[method] = (apart(method, scene, given.gib) if here else on_gpu(method, scene)) | about
             print(rows[method], flush=True)
-            write([rows[method] for method in METHODS if method in rows], given.page)
+            write([rows[method] for method in METHODS if method in rows], given.page, given.device)
     print(given.page)
 
 
