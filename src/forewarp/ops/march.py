@@ -139,6 +139,7 @@ def _crossings(origins: Tensor, directions: Tensor, low: Tensor, high: Tensor) -
 # March -----------------------------------------------------------------------------------------------------
 
 
+@torch.no_grad()
 def march(
     origins: Tensor, directions: Tensor, near: float, far: float, step: float, cells: Tensor, jitter: Tensor
 ) -> tuple[Tensor, Tensor]:
@@ -163,7 +164,7 @@ def march(
     """
     _check_march(origins, directions, near, far, step, jitter)
     if not use_numba(origins):
-        return march_reference(origins.detach(), directions.detach(), near, far, step, cells, jitter)
+        return march_reference(origins, directions, near, far, step, cells, jitter)
     from forewarp.ops.kernels import voxels as kernels
 
     counts, firsts = torch.zeros(2, len(origins), dtype=torch.int64).unbind()
