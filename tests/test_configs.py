@@ -25,6 +25,7 @@ from tests.support.tiny_scene import BOX, built
 PRESETS, MODELS = options("preset"), options("model")
 EXPERIMENTS = options("experiment")
 OF_THE_TABLES = [model for model in MODELS if model not in ("forward", "backward", "particles")]
+IN_SMALL = ("forward", "backward")  # with preset=compact
 OF_PARTICLES = [
     ("model/motion", "spline"),
     ("model/motion", "cosines"),
@@ -154,6 +155,8 @@ def every_section():
     """Every method and preset, with each experiment that its file has exceptions for, or any other."""
     for i, model in enumerate(MODELS):
         for j, preset in enumerate(PRESETS):
+            if preset == "compact" and model not in IN_SMALL:
+                continue
             names = [f"{model}_{preset}", *([model] if preset == "demo" else [])]
             files = [CONF / "numbers" / f"{name}.yaml" for name in names]
             texts = [parsed(file.read_text()).content for file in files if file.is_file()]
@@ -172,6 +175,25 @@ def test_every_section_of_numbers_composes_and_instantiates(model, preset, exper
         # Trained over the background that they are measured on.
         assert (config.data.background, config.data.eval_background) == ("black", "black")
         assert config.model.get("camera") == (True if "tineuvox" in model else None)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("model", IN_SMALL)
+def test_compact_differs_from_faithful_in_sizes_alone(model):
+    faithful, compact = (
+        OmegaConf.to_container(composed("data.scene=x", f"model={model}", f"preset={preset}"), resolve=True)
+        for preset in ("faithful", "compact")
+    )
+    sizes = {"share", "num_voxels", "background_num_voxels", "patches", "curriculum"}
+    for config in (faithful, compact):
+        for part in ("preset", "budget", "run", "modules", "plan"):
+            config.pop(part, None)
+        config["data"].pop("rays")
+        (config["model"].get("inpainter") or {}).pop("width", None)
+        for stage in config["stage"].values():
+            assert sizes <= set(stage)
+            assert all(stage.pop(size) is not None for size in sizes)
+    assert compact == faithful
 
 
 @pytest.mark.parametrize("model", ["forward", pytest.param("backward", marks=pytest.mark.slow)])

@@ -209,7 +209,9 @@ def test_an_ablation_takes_one_thing_from_all():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("preset", "tv_flow"), [("demo", 2.1e-4), ("fast", 1e-3), ("faithful", 1e-3)])
+@pytest.mark.parametrize(
+    ("preset", "tv_flow"), [("demo", 2.1e-4), ("fast", 1e-3), ("faithful", 1e-3), ("compact", 1e-3)]
+)
 def test_the_whole_method_has_the_papers_weights_and_networks_in_the_fine_stage(preset, tv_flow):
     config = composed(*HOOK, f"preset={preset}", "ablation=full")
     networks = {"upsampler", "inpainter"}
