@@ -103,7 +103,8 @@ def hull_surface(scene: Scene, frames: list[int], count: int) -> Cloud | None:
     for i, rgba in zip(frames, images):
         delay = abs(scene.train[i].time - scene.canonical_time)
         masks.append(dilate(rgba[..., 3] > 127, max(1, round(_DRIFT * delay * rgba.shape[1]))))
-    rough = Lattice.of_count(scene.box, _ROUGH**3)
+    side = max(max(camera.width, camera.height) for camera in cameras)  # small images tell no finer shape
+    rough = Lattice.of_count(scene.box, min(_ROUGH, side) ** 3)
     points = rough.to_world(rough.all_voxels())
     inside = visual_hull(points, cameras, masks)
     if not bool(inside.any()):
@@ -111,7 +112,7 @@ def hull_surface(scene: Scene, frames: list[int], count: int) -> Cloud | None:
     pad = max(rough.spacing)
     low, high = points[inside].amin(0) - pad, points[inside].amax(0) + pad
     box = Box(tuple(low.tolist()), tuple(high.tolist())).intersection(scene.box.padded(pad))
-    fine = Lattice.of_count(box, _FINE**3)
+    fine = Lattice.of_count(box, min(_FINE, 2 * side) ** 3)
     voxels = fine.all_voxels()
     # Only what the rough hull, a voxel wider, allows is looked at again.
     allowed = _grown(inside.reshape(rough.shape))
