@@ -15,7 +15,7 @@ GRANDCHILD = "import subprocess, sys; subprocess.run([sys.executable, '-c', 'inp
 
 def test_memory_is_that_of_a_process_and_of_all_that_it_started():
     with subprocess.Popen([sys.executable, "-c", GRANDCHILD], stdin=subprocess.PIPE) as process:
-        while len(found := family(process.pid)) < 2 or min(map(resident, found)) < 1e6:  # until both have begun
+        while len(found := family(process.pid)) < 2 or min(map(resident, found)) < 1e6:  # begun
             time.sleep(0.01)
         sampled = Sampled(process.pid)
         watch = threading.Thread(target=sampled.run)
