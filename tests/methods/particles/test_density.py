@@ -111,9 +111,10 @@ def test_opacity_counts_where_it_is_largest_and_is_bounded_there():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("share", [0.0, 1e-3, 0.2])
-def test_a_step_takes_opacity_of_what_its_image_shows_as_the_rate_falls(share):
-    module = module_with(DATA, numbers={"opacity_decay": share, "crowd_decay": 0.0, "density_until": 0.0})
+@pytest.mark.parametrize(("share", "hidden"), [(0.0, 0.0), (1e-3, 0.0), (0.2, 0.1), (0.0, 0.3)])
+def test_a_step_takes_opacity_of_what_its_image_shows_and_hides_as_the_rate_falls(share, hidden):
+    numbers = {"opacity_decay": share, "crowd_decay": 0.0, "hidden_decay": hidden, "density_until": 0.0}
+    module = module_with(DATA, numbers=numbers)
     method, optimizer = module.method, module.configure_optimizers()
     (group,) = (group for group in optimizer.param_groups if group["name"] == "opacity")
     method.means.data[:3] = 90.0  # beside every image
@@ -129,13 +130,14 @@ def test_a_step_takes_opacity_of_what_its_image_shows_as_the_rate_falls(share):
         look(module, DATA)
         method.opacity.grad = torch.zeros_like(method.opacity)
         optimizer.step()
-        expected = torch.where(method.image_count[:, None] > 0, 1 - factor * share, 1.0).double()
+        shown = method.image_count[:, None] > 0
+        expected = torch.where(shown, 1 - factor * share, 1 - factor * hidden).double()
         assert 0 < int(method.image_count.sum()) < len(expected) - 3
         left = method.opacity.data.double().sigmoid() / before.double().sigmoid()
         torch.testing.assert_close(left, expected, rtol=1e-5, atol=0)
     group["base_lr"] = group["lr"] = 0.0  # what does not learn does not decay
     method.advance(0.5, 0, optimizer)
-    assert method.decay == 0
+    assert method.decay == method.hidden_decay == 0
 
 
 @pytest.fixture

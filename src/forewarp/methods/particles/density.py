@@ -141,22 +141,26 @@ def bound_opacity(particles: Particles) -> None:
 
 @torch.no_grad()
 def decay_opacity(particles: Particles) -> None:
-    """Take a share, ``decay`` in [0, 1), of the opacity of particles that a step's images showed.
+    """Take a share of the opacity of particles: ``decay`` of those that a step's images showed,
+    ``hidden_decay`` of the others, both in [0, 1).
 
-    Few images leave open what stands where; what none of those that show it asks for fades, and goes. Where
-    time adds to opacity, it is taken of that without. A step that was dropped has no gradient, and takes
-    nothing.
+    Few images leave open what stands where; what none of those that show it asks for fades, and goes. What
+    most images do not show, as it lies behind other things, may move there as it likes, and is wrong
+    where a view shows it after all: unless images ask for it again and again, it fades, too. Where time adds
+    to opacity, it is taken of that without. A step that was dropped has no gradient, and takes nothing.
 
-    Cost: some six operations a particle and image; none where the share is 0.
+    Cost: some six operations a particle and image; none where the shares are 0.
 
     Source: as in "Binocular-Guided 3D Gaussian Splatting with View Consistency for Sparse View Synthesis"
-    (NeurIPS 2024), there of all particles and throughout.
+    (NeurIPS 2024), there one share for all particles and throughout.
     """
-    base, share = particles.opacity.data, particles.decay
-    if share > 0 and particles.opacity.grad is not None:
+    base, shown_share, hidden_share = particles.opacity.data, particles.decay, particles.hidden_decay
+    if (shown_share > 0 or hidden_share > 0) and particles.opacity.grad is not None:
         for shown in particles.shown_now:
-            taken = torch.log1p(share * base.exp()) - math.log1p(-share)  # of the logit
-            base.sub_(torch.where(shown[:, None], taken, 0.0))
+            share = torch.where(shown, base.new_tensor(shown_share), base.new_tensor(hidden_share))
+            if particles.shared is not None:
+                share[particles.shared >= 0] = 0.0
+            base[:, 0] -= torch.log1p(share * base[:, 0].exp()) - torch.log1p(-share)  # of the logit
     particles.shown_now.clear()
 
 

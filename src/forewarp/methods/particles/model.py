@@ -100,7 +100,7 @@ class Particles(Method):
         self.views, times = len(start.scene.train), start.scene.instants
         effects = Effects(**choices).only(self.stage.effects, len(times))
         self.ends = min(times), max(times)
-        self.progress = self.decay = 0.0
+        self.progress = self.decay = self.hidden_decay = 0.0
         self.shown_now: list[Tensor] = []  # which particles each image of this step showed
 
         self.box = start.scene.box if self.stage.shell and not start.scene.has_alpha else None
@@ -380,7 +380,7 @@ class Particles(Method):
         """See ``Method``: scale learning rates by the scene, and control density where it is time.
 
         Rates of lengths are of the scene's extent; that of the skinning follows the number of images, and the
-        decay of opacity the rate of opacity.
+        decays of opacity the rate of opacity.
         """
         self.progress, stage = progress, self.stage
         density.bound_opacity(self)
@@ -392,8 +392,10 @@ class Particles(Method):
                 if self.nodes.time_offsets.learns:
                     self.nodes.time_offsets.settle(group["lr"])
             elif group["name"] == "opacity":
+                learns = group["lr"] / (group["base_lr"] or 1.0)
                 decay = stage.decay(float(self.final_count), float(self.covered_pixels))
-                self.decay = min(0.99, decay * group["lr"] / (group["base_lr"] or 1.0))  # rates may rise
+                self.decay = min(0.99, decay * learns)  # rates may rise
+                self.hidden_decay = min(0.99, stage.hidden_decay * learns)
             elif group["name"] == "skinning":
                 group["lr"] *= view_share(self.views)
         number = int(progress / stage.density_interval)

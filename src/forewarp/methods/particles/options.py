@@ -103,6 +103,7 @@ class Numbers:
         opacity_decay: share of their opacity that a step takes from the particles that its image shows, while
             the learning rate of opacity is its first; as that falls, so does the share.
         crowd_decay: extra opacity decay per step, scaled by ``max(0, 1 - covered_pixels / final_count)``.
+        hidden_decay: as ``opacity_decay``, of the particles that the image does not show.
         rigid_final_factor: factor that the weight of ``rigid`` falls to by the end.
         shell: far planes of the cameras at which particles stand behind all that images show; what is outside
             the box is at rest; at least 1. 0: particles begin in the box, and all may move. Images with alpha
@@ -130,6 +131,7 @@ class Numbers:
     time_offsets: float = 1.5
     opacity_decay: float = 0.0
     crowd_decay: float = 2.5e-3
+    hidden_decay: float = 0.0
     rigid_final_factor: float = 0.17
     shell: float = 0.0
     name: str = "fine"
@@ -149,7 +151,11 @@ class Numbers:
             (shares, "a number in (0, 1]", lambda value: 0 < value <= 1),
             (("density", "nodes", "knots", "jitter_until"), "a number > 0", lambda value: value > 0),
             (("edges", "relink"), "a whole number >= 1", lambda value: value >= 1 and value == int(value)),
-            (("opacity_decay", "crowd_decay"), "a number in [0, 1)", lambda value: 0 <= value < 1),
+            (
+                ("opacity_decay", "crowd_decay", "hidden_decay"),
+                "a number in [0, 1)",
+                lambda value: 0 <= value < 1,
+            ),
             (
                 ("density_until", "rest_from", "jitter", "time_offsets"),
                 "a number >= 0",
