@@ -44,14 +44,20 @@ def scenes(tmp_path_factory):
 
 
 @pytest.fixture(scope="session")
-def fitted(scenes, tmp_path_factory):
-    """``fitted(name, dataset)`` returns the run, its fitted module, and the loss of every step."""
+def fitted(scenes, tmp_path_factory, request):
+    """``fitted(name, dataset)`` returns the run, its fitted module, and the loss of every step.
+
+    Where no slow test is run, which alone look at how well a method learns, it is fitted for some steps only.
+    """
     from tests.contract.fitting import Losses, run_of, stage_of
+
+    whole = any(item.get_closest_marker("slow") for item in request.session.items)
 
     @cache
     def fit(name, dataset):
         losses, folder = Losses(), tmp_path_factory.mktemp(f"{name}_{dataset}")
-        run = run_of([stage_of(METHODS[name])], data_of(dataset, scenes), folder, losses)
+        stage = stage_of(METHODS[name], **({} if whole else {"steps": 20}))
+        run = run_of([stage], data_of(dataset, scenes), folder, losses)
         return SimpleNamespace(run=run, module=run.fit(), losses=losses.values)
 
     return fit

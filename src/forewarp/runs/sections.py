@@ -14,6 +14,7 @@ In every folder that Hydra searches, ``conf/`` or that of another package,
 
 from __future__ import annotations
 
+from copy import copy
 from functools import lru_cache
 from importlib import resources
 from pathlib import Path
@@ -30,14 +31,18 @@ OF_STAGES = ("stage", "objective")  # sections relative to their group, as Hydra
 OF_ALL = ("effects", "exceptions", "scenes")  # sections whose keys are those of the whole config
 
 
+_stored: dict[str, str] = {}  # what Hydra's store, which lasts as long as this process, has of each sweep
+
+
 def serve(sweeps: Path) -> None:
     """Have Hydra read folders with their sections, and a folder's files as ``sweeps``, in this process."""
     ours = {"file": FileConfigSource, "pkg": ImportlibResourcesConfigSource}
     SourcesRegistry.instance().types.update(ours)
     store = ConfigStore.instance()  # on Hydra's search path the folder above would be a config group
     for file in sorted(sweeps.glob("*.yaml")):
-        content = parsed(file.read_text("utf-8")).content
-        store.store(file.stem, content, "sweeps", "_global_", provider="forewarp")
+        if _stored.get(file.stem) != (text := file.read_text("utf-8")):
+            store.store(file.stem, parsed(text).content, "sweeps", "_global_", provider="forewarp")
+            _stored[file.stem] = text
 
 
 class _File(NamedTuple):
@@ -58,7 +63,13 @@ class _Sections:
 
     def __init__(self, provider: str, path: str) -> None:
         super().__init__(provider, path)
-        self._files: dict[str, _File | None] = {}  # Hydra copies the source for each composition
+        self._files: dict[str, _File | None] = {}
+
+    def __deepcopy__(self, memo: dict) -> _Sections:
+        """Return a source that has read nothing yet: Hydra copies it for each composition."""
+        fresh = copy(self)
+        fresh._files = {}
+        return fresh
 
     def load_config(self, config_path: str) -> ConfigResult:
         """Return a file, or a section as if it were a file of its own."""
