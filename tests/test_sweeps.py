@@ -12,6 +12,8 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 
+from forewarp.methods.particles.options import EFFECTS
+from forewarp.methods.voxel.structure import NAMES
 from forewarp.runs.build import build_run
 from forewarp.runs.config import hashed
 from forewarp.runs.overrides import key_of, merged
@@ -87,19 +89,17 @@ def test_every_scene_and_choice_composes_and_has_a_folder_of_its_own():
         assert len({hashed(job_of(sweep, *job)).run for job in jobs}) == len(jobs), sweep
 
 
-@pytest.mark.slow
-def test_effects_are_compared_on_every_specimen():
+def test_effects_are_compared_with_the_preset_with_all_and_with_none():
     jobs = jobs_of("effects")
-    assert len(jobs) == 18
-    auto, every, paper = (job_of("effects", *job) for job in jobs if "scene=specimen_room" in job)
-    assert {config.run.split("-")[0] for config in (auto, every, paper)} == {
-        f"runs/effects/room/{name}" for name in ("auto", "all_effects", "full")
-    }
-    assert auto.effects == "auto"
-    effects = ("motion", "view_dependence", "upsampler", "inpainter", "background")
-    assert None not in [every.model[effect] for effect in effects]
-    assert every.model.trajectory.features > 0
-    assert paper.model.background is None
+    assert len(jobs) == 24
+    auto, base, every, none = (job_of("effects", *job) for job in jobs if "scene=specimen_still" in job)
+    folders = [config.run.split("-")[1] for config in (auto, base, every, none)]
+    assert folders == ["auto", "base", "all_effects", "no_effects"]
+    assert (auto.effects, base.effects) == ("auto", "given")
+    assert None not in [every.model[name] for name in NAMES]
+    assert {none.model[name] for name in NAMES} == {None}
+    particles = job_of("effects", "model=particles", "ablation=all_effects_particles", "scene=specimen_still")
+    assert None not in [particles.model[effect.name] for effect in EFFECTS]
 
 
 def test_seeds_repeat_every_job():

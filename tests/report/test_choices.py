@@ -121,57 +121,48 @@ def test_scenes_and_minutes_stand_apart_and_the_page_is_named_after_most_runs(tm
     assert "Of test views between the training times:" in text
 
 
-def write_choice(
-    root, choice, *, scene="ball", seed=0, calls_for=None, on=(), psnr=30.0, curve=SLOW, model="forward"
-):
+def write_choice(root, choice, *, scene="ball", seed=0, on=(), psnr=30.0, model="forward"):
     """A run of a choice; of ``auto`` with its plan."""
-    own = {"calls_for": calls_for, "model": {"name": model}}
-    more = {"scene": scene, "psnr": psnr, "curve": curve, "against": "all_effects"}
-    folder = write_run(root, choice, seed, **more, config=own)
+    more = {"scene": scene, "psnr": psnr, "against": "base"}
+    folder = write_run(root, choice, seed, **more, config={"model": {"name": model}})
     if choice == "auto":
         effects = {
             name: {"choice": "x" if name in on else "none", "on": name in on, "because": f"{name}, 3 %"}
             for name in ("motion", "view")
         }
-        trials = {name: {"psnr": 1.25, "noise": 0.5} for name in on}
-        plan = {"overrides": [], "effects": effects, "seconds": 12.5, "evidence": {"trials": trials}}
+        plan = {"overrides": [], "effects": effects, "seconds": 12.5, "evidence": {}}
         (folder / "plan.yaml").write_text(yaml.safe_dump(plan))
     return folder
 
 
-def test_the_page_of_effects_compares_and_says_why(tmp_path):
-    write_choice(tmp_path / "runs", "auto", calls_for=["motion"], on=["motion"], psnr=31.0, curve=QUICK)
-    write_choice(tmp_path / "runs", "all_effects", calls_for=["motion"], psnr=30.0)
-    write_choice(tmp_path / "runs", "auto", calls_for=[], on=["view"], scene="cube")
-    write_choice(tmp_path / "runs", "auto", calls_for=[], scene="cube", seed=1)
+def test_the_page_of_effects_compares_with_the_best_and_says_why(tmp_path):
+    for seed, gain in ((0, 0.9), (1, 1.1)):
+        write_choice(tmp_path / "runs", "auto", seed=seed, on=["motion"], psnr=31.0 + gain)
+        write_choice(tmp_path / "runs", "base", seed=seed, psnr=31.0)
+        write_choice(tmp_path / "runs", "no_effects", seed=seed, psnr=20.0)
     write_choice(tmp_path / "runs", "auto", scene="hook", on=["motion", "view"], psnr=27.0)
+    write_choice(tmp_path / "runs", "all_effects", scene="hook", psnr=28.0)
     write_choice(tmp_path / "more", "auto", on=["view"], model="particles")
     page, table, *others = write_effects(tmp_path, tmp_path / "out")
     assert [file.name for file in others] == ["effects-particles.md", "effects-particles.csv"]
     assert others[0].read_text().startswith("# Only the effects a scene calls for: model=particles")
     text = page.read_text()
-    ball, specimen = rows_of(text.partition("## Other")[0], "ball")
-    assert ball[1:] == ["1", "31.00", "30.00", "+1.00", "10", "50", "12"]
-    assert specimen[1:] == ["0", "motion", "motion", "as made"]
-    cubes = [row[2:] for row in rows_of(text, "cube")[1:3]]
-    assert cubes == [["nothing", "view", "**otherwise**"], ["nothing", "nothing", "as made"]]
-    assert "2 of 3 plans turn on what is called for and nothing else" in text
-    gains = text.partition("## What each effect is worth")[2].partition("## Why")[0]
-    assert rows_of(gains, "hook") == [["hook", "0", "+1.25 ± 0.50", "+1.25 ± 0.50"]]
+    (ball,), (hook,) = (rows_of(text.partition("## Why")[0], name) for name in ("ball", "hook"))
+    assert ball[3:5] == ["32.00 ± 0.14", "31.00 ± 0.00"]
+    assert ball[-3:] == ["+1.00 ± 0.14", "above, the preset", "12.5 ± 0.0"]
+    assert hook[-3:] == ["-1.00", "**below**, every effect", "12.5"]
     assert ["hook", "view", "x", "view, 3 %"] in rows_of(text.partition("## Why")[2], "hook")
-    assert text.index("## Specimens") < text.index("## Other scenes") < text.index("## Why")
-    assert len(table.read_text().splitlines()) == 6
+    assert len(table.read_text().splitlines()) == 9
 
 
 def test_seeds_are_paired_and_what_is_missing_is_empty(tmp_path):
-    for seed in (0, 1):
-        write_choice(tmp_path, "auto", seed=seed, psnr=30.0 + seed)
+    for seed, psnr in ((0, 30.0), (1, 30.55)):
+        write_choice(tmp_path, "auto", seed=seed, psnr=psnr)
     write_choice(tmp_path, "all_effects", seed=1, psnr=30.5)
     write_choice(tmp_path, "auto", scene="hook")
-    rows = choices(read_runs(tmp_path)[0]).rows
-    assert rows[0][4].mean == 0.5  # of the second seed alone
-    assert rows[1][3:7] == [None, None, None, None]
-    assert rows[2][3] is None
+    ball, hook = choices(read_runs(tmp_path)[0]).rows
+    assert (ball[-3].mean, ball[-2]) == (pytest.approx(0.05), "within noise (0.10), every effect")
+    assert hook[-4:-1] == [None, None, ""]
 
 
 def test_of_two_runs_of_a_choice_the_last_one_counts(tmp_path):
@@ -179,7 +170,7 @@ def test_of_two_runs_of_a_choice_the_last_one_counts(tmp_path):
     last = write_choice(tmp_path / "b", "auto", psnr=31.0)
     os.utime(last / "metrics.json", (2e9, 2e9))
     text = write_effects(tmp_path, tmp_path / "out")[0].read_text()
-    assert rows_of(text, "ball")[0][2] == "31.00"
+    assert rows_of(text, "ball")[0][3] == "31.00"
 
 
 def test_trials_of_a_search_are_listed_the_best_first(tmp_path, in_tmp):

@@ -1,23 +1,15 @@
 """
-forewarp-plan finds out which effects a scene calls for, and says for each the number that decides. It reads
-the pictures and fits short runs. Of particles it leaves out one effect after the other, and keeps those that
-are missed; of voxels (model=forward) it measures what coarse stages leave unexplained, and tries the effects
-that are still open. It scores on training views that it sets aside, never on test views.
+forewarp-plan says which effects a scene calls for, each with the number that decides. It reads the training
+images; where silhouettes stand still it also fits the scene for some seconds without effects, and looks at
+what is left over. What nothing speaks against stays as the preset has it. It never looks at test views.
 
-  forewarp-plan scene=specimen_glossy                           a synthetic scene that calls for one effect
+  forewarp-plan scene=specimen_glossy                           a synthetic scene that stands still
   forewarp-plan experiment=dnerf data.root=../data/dnerf data.scene=hook
   forewarp-train plan=runs/hook/plan-0123456789/plan.yaml       fit what it says
   forewarp-train experiment=dnerf data.root=../data/dnerf data.scene=hook effects=auto     both at once
 
-All overrides of forewarp-train work here too; what is typed is fixed, and not decided by the plan. What one
-types most:
-  plan.minutes=N         plan for a run of N minutes: an effect must be worth the steps it costs
-  plan.least=DB          gain below which an effect does not count; particles 0.6 dB, voxels 0.1
-  plan.trials=false      only coarse stages, no trials: less sure, in a third of the time
-  plan.seeds=N           seeds of every trial
-  plan.steps=N plan.seconds=N              bounds of a coarse stage; the first that is reached ends it
-  plan.trial_steps=N plan.trial_seconds=N  bounds of a trial; a few have two or three times as much
-  plan.folder=FOLDER     where plan.yaml and the trials go; an interrupted plan goes on there
+All overrides of forewarp-train work here too; what is typed is fixed, and not decided by the plan.
+  plan.folder=FOLDER     where plan.yaml and the short fit go
 Overrule a plan by an override: forewarp-train plan=FILE model/view_dependence=none
 """
 
@@ -34,7 +26,7 @@ def plan(config) -> None:
 
     if isinstance(config.plan, str):
         raise ValueError(
-            f"plan: expected keys as plan.minutes=10, but got {config.plan}; forewarp-train takes a file"
+            f"plan: expected keys as plan.folder=FOLDER, but got {config.plan}; forewarp-train takes a file"
         )
     refuse_all(config)
     refuse_missing_scene(config)

@@ -13,7 +13,7 @@ What it runs:
   ablations       what each part of the paper's method brings on counterparts, at equal minutes and steps
   accuracy-time   accuracy of each choice against training time, on one scene
   price-list      what each choice costs and brings, on the procedural vehicle and real scenes
-  effects         planned effects against every effect; of model=particles the plans alone
+  effects         what a scene calls for, the preset, every effect and none
   gpu             seconds of steps and frames, and PSNR against seconds, of model=forward on device=gpu
 
 Keys (capitals do, too):
@@ -71,7 +71,7 @@ OF_ABLATIONS = shlex.split(
 ROOM = ["stage.coarse.background_num_voxels=[[0,27000]]", "stage.fine.background_num_voxels=[[0,110592]]"]
 SPECIMENS = ["still", "rigid", "band", "glossy", "room", "quick", "daylight", "blocks", "spin"]
 # With small=1, beside Job.small; gpu has a tiny model, too.
-SMALL = shlex.split("sheets=0 logger=none callbacks.pictures=null plan.steps=4 plan.trial_steps=4")
+SMALL = shlex.split("sheets=0 logger=none callbacks.pictures=null")
 TINY = shlex.split(
     "data.scene=tiny paths.data=runs/bench-gpu data.synthesis.size=32 data.synthesis.frames=8 "
     "data.synthesis.test_views=[1,1,1] preset.rays=64 preset.inpainter_width=16 data.held_out=2 "
@@ -291,23 +291,15 @@ def price_list(keys: Keys) -> Job:
 
 
 def effects(keys: Keys) -> Job:
-    """Compare plans with every effect at once and, on real scenes, with the paper's set and the preset."""
-    model = keys.model or "forward"
-    real, minutes = keys.chosen(*words(keys.scenes or "jumpingjacks hook")), keys.minutes
-    base = ["sweeps=effects", *keys.drawn("" if real else "2")]
-    if model == "particles":
-        scene = real or [f"scene={','.join(f'specimen_{name}' for name in SPECIMENS)}"]
-        lane = [[*base, "model=particles", "ablation=auto", f"budget.minutes={minutes or 0.5}", *scene]]
-    elif model != "forward":
-        raise ValueError(f"model: expected forward or particles, which can be planned, but got {model}")
-    elif not real:
-        lane = [[*base, "ablation=auto"]]
-        lane += [[*base, "ablation=all_effects", f"budget.minutes={minutes or 2}"]]
-    else:
-        base += [*real, f"budget.minutes={minutes or 2}", f"plan.minutes={minutes or 2}"]
-        base += ["plan.seconds=40", "plan.trial_seconds=40"]
-        lane = [[*base, f"ablation={name}"] for name in ("auto", "all_effects", "full", "base")]
-    return Job([lane], [["report", "kind=effects", *_out(keys)]])
+    """Compare what a scene calls for with the preset, with every effect and with none."""
+    model = keys.model or "particles"
+    if model not in ("particles", "forward"):
+        raise ValueError(f"model: expected particles or forward, whose effects are compared, but got {model}")
+    every = "all_effects" + "_particles" * (model == "particles")
+    lane = ["sweeps=effects", *keys.drawn("" if keys.data else "2"), f"model={model}"]
+    lane += [f"ablation=auto,base,{every},no_effects", f"budget.minutes={keys.minutes or 1}"]
+    scenes = keys.chosen(*words(keys.scenes or "bouncingballs hook"))
+    return Job([[[*lane, *scenes]]], [["report", "kind=effects", *_out(keys)]])
 
 
 def gpu(keys: Keys) -> Job:

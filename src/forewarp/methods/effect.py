@@ -1,20 +1,91 @@
-"""Effects: a method's optional parts, and how a plan decides which of them a scene needs."""
+"""Effects: a method's optional parts, and what a scene's images say of each."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Protocol
+from dataclasses import dataclass
 
 from forewarp.methods.method import Method
-from forewarp.metrics.gain import Gain
-from forewarp.scene.frame import Scene, Survey
-from forewarp.scene.view import Target
+from forewarp.scene.frame import Survey
 
 CUT_OUT = 0.001  # share of transparent pixels below which the scene has a background
-DISAGREEMENT = 0.01  # share of the foreground that no static shape explains, above which something moves
+# Share of the foreground that no static shape explains, up to which silhouettes stand still. Of nineteen
+# scenes those that stand still have 0.0 %, the others from 0.37 % (things that appear) on.
+STILL = 0.001
+ENOUGH = 40  # images from which on it counts that nothing is seen to change
 NARROW = 15.0  # degrees between the most different cameras below which direction cannot be observed
+# Least shares of what a short still fit leaves over that time, and direction, explain. By time scenes that
+# stand still have -0.07 to -0.02, one whose light moves 0.17 to 0.35; by direction a matte one 0.06, a glossy
+# one 0.22.
+BY_TIME, BY_DIRECTION = 0.05, 0.1
+
+
+@dataclass(frozen=True)
+class Residual:
+    """Errors that a short still fit of a scene leaves in its training images.
+
+    Attributes:
+        by_time, by_direction: shares of the squared error that colours changing over time, or with the
+            direction of view, explain, beyond what a constant colour does. Negative: they fit noise.
+        seconds: training time of the fit.
+    """
+
+    by_time: float
+    by_direction: float
+    seconds: float
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What is known of a scene: what its images say and, where silhouettes stand still, a still fit."""
+
+    pictures: Survey
+    residual: Residual | None = None
+
+    @property
+    def cut_out(self) -> bool:
+        """Whether the subject is cut out, so that silhouettes say something."""
+        return self.pictures.cut_out >= CUT_OUT
+
+    @property
+    def silhouettes_rest(self) -> bool:
+        """Whether there are many silhouettes of several times, and one static shape explains them all."""
+        seen = self.pictures
+        return self.cut_out and seen.times > 1 and seen.frames >= ENOUGH and seen.disagreement <= STILL
+
+    def of_time(self) -> tuple[bool, str]:
+        """Tell whether anything may change over time, and why."""
+        if self.pictures.times < 2:
+            return False, "1 time: nothing can be seen to change"
+        why = f"{self.pictures.times} times"
+        if not self.cut_out:
+            return True, f"{why}; without silhouettes, motion is taken for granted"
+        why += f"; a static shape explains all but {self.pictures.disagreement:.1%} of the silhouettes"
+        if self.residual is None:
+            return True, why
+        share = self.residual.by_time
+        return share > BY_TIME, f"{why}, and time {max(share, 0):.0%} of what a still fit leaves over"
+
+    def of_direction(self) -> tuple[bool, str]:
+        """Tell whether colour may depend on direction, and why."""
+        spread = self.pictures.spread
+        if spread < NARROW:
+            return False, f"all cameras lie within {spread:.0f} degrees: direction is not seen"
+        why = f"cameras differ by {spread:.0f} degrees"
+        if self.residual is None:
+            return True, why
+        share = self.residual.by_direction
+        return share > BY_DIRECTION, f"{why}; it explains {max(share, 0):.0%} of what a still fit leaves over"
+
+    def of_background(self) -> tuple[bool, str]:
+        """Tell whether there is a background beside the subject, and why."""
+        share = self.pictures.cut_out
+        return not self.cut_out, f"{share:.0%} of the pixels are transparent"
+
+
+def always(evidence: Evidence) -> tuple[bool, str]:
+    """Leave an effect to the preset, as no image speaks against it."""
+    return True, "as the preset has it"
 
 
 @dataclass(frozen=True)
@@ -22,29 +93,17 @@ class Effect:
     """An optional part of a method; off, it has no parameters and costs no time.
 
     Attributes:
-        name: name of the config group ``model/<name>``.
-        on: the usual option that switches it on; ``none`` switches it off.
+        name: name of the config group ``model/<name>``, where ``none`` switches it off.
         attribute: the method's attribute, perhaps a dotted name, that is None while the effect is off; by
             default ``name``.
-        later: True: decide it after the coarse stage, by a trial with and without it. False: decide it by
-            what ``Planning.coarse`` asks for.
-        rules_out: returns True if the evidence makes a trial of a ``later`` effect pointless.
-        with_it: returns further overrides, for the final run to be as its trial was.
-        rests: True for what brings matter to rest: how much of it is evidence.
+        of: tells whether the evidence allows the effect, and why.
+        needs: name of an effect without which this one does nothing.
     """
 
     name: str
-    on: str
     attribute: str | None = None
-    later: bool = False
-    rules_out: Callable[[Evidence], bool] = lambda evidence: False
-    with_it: Callable[[Asked], Sequence[str]] = lambda asked: ()
-    rests: bool = False
-
-    @property
-    def group(self) -> str:
-        """Name of the effect's config group."""
-        return f"model/{self.name}"
+    of: Callable[[Evidence], tuple[bool, str]] = always
+    needs: str | None = None
 
     def is_on(self, method: Method) -> bool:
         """Return whether the effect is on in a method."""
@@ -61,195 +120,38 @@ def switched(method: Method) -> dict[str, bool]:
 
 @dataclass(frozen=True)
 class Decision:
-    """The decision on an effect: the option chosen, the overrides (``overrides``) that choose it, the reason.
-
-    ``on`` is False for the least that can be chosen.
-    """
+    """The option ``choice`` of an effect's config group, and why; ``on``: it is not ``none``."""
 
     effect: str
     choice: str
-    overrides: tuple[str, ...]
     because: str
-    on: bool = False
+
+    @property
+    def on(self) -> bool:
+        """Whether the effect is on."""
+        return self.choice != "none"
 
 
-@dataclass
-class Evidence:
-    """What is known of a scene so far; a method's planning may extend it.
+def decide(
+    effects: Sequence[Effect], evidence: Evidence, preset: Mapping[str, str], typed: Mapping[str, str]
+) -> list[Decision]:
+    """Decide on all effects of a method: the preset's choice, unless the evidence rules an effect out.
 
-    Attributes:
-        pictures: what the images alone say.
-        gains: result of each trial, by effect.
-        least: dB; a smaller gain counts as none.
-        minutes: planned for the last stage; None: choose the cheapest option within noise of the best.
-        slope: dB that the fine trial without effects gained in the second half of its ``steps``.
-        steps: steps of that trial.
-        step: seconds per step of that trial; None if unknown.
-        at_rest: share of the matter that came to rest in trials with an effect that ``rests``, by effect;
-            mean over seeds.
-        most_steps: of the planned run's last stage, whatever its minutes; None: only they end it.
+    Args:
+        effects: in an order in which each comes after what it needs.
+        evidence: of the scene.
+        preset: the option of each effect that the preset has for such images.
+        typed: those that the user typed, which win.
     """
-
-    pictures: Survey
-    gains: dict[str, Gain] = field(default_factory=dict)
-    least: float = 0.1
-    minutes: float | None = None
-    slope: float = 0.0
-    steps: int = 1
-    step: float | None = None
-    at_rest: dict[str, float] = field(default_factory=dict)
-    most_steps: int | None = None
-
-    @property
-    def cut_out(self) -> bool:
-        """Whether the subject is cut out, so that silhouettes say something."""
-        return self.pictures.cut_out >= CUT_OUT
-
-    @property
-    def seen_to_move(self) -> str:
-        """Describe what the images say of motion."""
-        why = f"{self.pictures.times} times"
-        if not self.cut_out:
-            return why
-        seen = self.pictures.disagreement
-        return f"{why}; silhouettes: a static shape explains all but {seen:.1%} of the foreground"
-
-    @property
-    def no_direction(self) -> str | None:
-        """Say why the images cannot show colour that depends on direction; None if they can."""
-        spread = self.pictures.spread
-        why = f"all cameras lie within {spread:.0f} degrees: direction is not seen"
-        return why if spread < NARROW else None
-
-    def price(self, gain: Gain) -> float:
-        """Return the PSNR (dB) lost to the steps that an effect's extra time displaces.
-
-        Assume that PSNR approaches its limit as ``1 / sqrt(steps)``, fitted to ``slope``. The price is 0 if
-        no minutes are given, or if the trials had equal time.
-        """
-        if None in (self.minutes, self.step, gain.steps) or gain.times <= 1:
-            return 0.0
-        most = math.inf if self.most_steps is None else self.most_steps
-        without, with_it = (min(max(60 * self.minutes / (self.step * k), 1.0), most) for k in (1, gain.times))
-        scale = max(self.slope, 0.0) / (math.sqrt(2) - 1) * math.sqrt(self.steps)
-        return scale * (1 / math.sqrt(with_it) - 1 / math.sqrt(without))
-
-    def pays(self, effect: str) -> bool | None:
-        """Return whether an effect's gain exceeds its noise and its price; None without a trial."""
-        gain = self.gains.get(effect)
-        return None if gain is None else gain.psnr > max(gain.noise, self.bound(effect)) + self.price(gain)
-
-    def calls_for(self, effect: str, otherwise: bool) -> bool:
-        """Return whether an effect pays; without a trial, ``otherwise``."""
-        pays = self.pays(effect)
-        return otherwise if pays is None else pays
-
-    def hopeless(self, effect: str) -> bool:
-        """Return whether the trials so far rule an effect out, so that no other seed need be tried."""
-        gain = self.gains[effect]
-        return gain.psnr + gain.noise < self.bound(effect)
-
-    def bound(self, effect: str) -> float:
-        """Return the gain (dB) below which an effect does not count."""
-        return self.least
-
-    def of_trial(self, effect: str) -> str:
-        """Describe an effect's trial; an empty string without one."""
-        gain = self.gains.get(effect)
-        if gain is None:
-            return ""
-        price = self.price(gain)
-        return f"; {gain}, {self.asked_of(effect)}" + (
-            f", whose steps are worth {price:.2f} dB" if price >= 0.005 else ""
-        )
-
-    def asked_of(self, effect: str) -> str:
-        """Say what an effect's gain must exceed beside its price."""
-        return f"more than {max(self.gains[effect].noise, self.bound(effect)):.2f} asked"
-
-
-@dataclass(frozen=True)
-class Asked:
-    """The run to plan.
-
-    Attributes:
-        stages: the configured numbers of each stage, in order.
-        preset: the preset's numbers.
-        typed: overrides that the user typed (key -> value); they are kept, not decided.
-        choose: returns the option that switches an effect on.
-        trials: whether trials may be run.
-    """
-
-    stages: Mapping[str, Mapping]
-    preset: Mapping
-    typed: Mapping[str, str]
-    choose: Callable[[str], str]
-    trials: bool
-
-    @property
-    def coarse(self) -> str:
-        """Name of the first stage."""
-        return next(iter(self.stages))
-
-    @property
-    def last(self) -> str:
-        """Name of the last stage."""
-        return list(self.stages)[-1]
-
-    def decided(self, effect: str, on: bool, because: str, others: Sequence[str] = ()) -> Decision:
-        """Return the decision on an effect, but what the user typed for it; ``others``: further overrides."""
-        typed = self.typed.get(f"model/{effect}")
-        if typed is not None:
-            return Decision(effect, typed, tuple(others), f"as typed; {because}", typed != "none")
-        choice = self.choose(effect) if on else "none"
-        return Decision(effect, choice, (f"model/{effect}={choice}", *others), because, on)
-
-
-class CoarseTrials(Protocol):
-    """What a method may try with coarse stages, each of a name and of overrides."""
-
-    def begin(self, name: str, overrides: Sequence[str], *, change: bool = False) -> None:
-        """Fit a coarse stage and continue from it; with ``change`` of the coarse stage before."""
-
-    def rival(self, effect: str, name: str, overrides: Sequence[str], *, adds: bool = False) -> bool:
-        """Fit another coarse stage, which differs in ``overrides``; continue from the better one.
-
-        The rival has the ``effect`` if it ``adds`` it, else it lacks it. Return whether the effect pays.
-        """
-
-    def drop(self, effect: str, overrides: Sequence[str], *, longer: int = 1) -> bool:
-        """Continue the coarse stage with and, by ``overrides``, without an effect, at equal steps.
-
-        If the effect is not missed, all later trials do without it. Return whether it pays. ``longer``: how
-        many times the usual steps.
-        """
-
-
-class Planning(Protocol):
-    """How a method's effects are decided: the attribute ``planning`` of its model.
-
-    ``steps`` and ``trial_steps`` are the steps of a coarse stage and of a trial, and ``least`` the gain (dB)
-    below which an effect does not count, unless the user says.
-    """
-
-    effects: Sequence[Effect]
-    steps: int
-    trial_steps: int
-    least: float
-
-    def evidence(self, pictures: Survey, **bounds) -> Evidence:
-        """Begin the evidence with what the images say."""
-
-    def always(self, asked: Asked) -> tuple[Sequence[str], Sequence[str]]:
-        """Return the overrides of every trial, and the additional ones of fine trials."""
-
-    def coarse(self, evidence: Evidence, asked: Asked, trials: CoarseTrials) -> None:
-        """Fit coarse stages, and try what they tell of effects."""
-
-    def look(
-        self, evidence: Evidence, method: Method, scene: Scene, targets: Sequence[Target], asked: Asked
-    ) -> None:
-        """Add to the evidence what the chosen coarse stage shows."""
-
-    def decide(self, evidence: Evidence, asked: Asked) -> list[Decision]:
-        """Decide on every effect."""
+    decisions: dict[str, Decision] = {}
+    for effect in effects:
+        allowed, why = effect.of(evidence)
+        if effect.needs in decisions and not decisions[effect.needs].on:
+            allowed, why = False, f"does nothing without {effect.needs.replace('_', ' ')}"
+        choice = preset.get(effect.name, "none") if allowed else "none"
+        if allowed and choice == "none":
+            why = "off in the preset"
+        if effect.name in typed:
+            choice, why = typed[effect.name], f"as typed; {why}"
+        decisions[effect.name] = Decision(effect.name, choice, why)
+    return list(decisions.values())

@@ -299,14 +299,6 @@ class HasBounds(Protocol):
 
 
 @runtime_checkable
-class HasRest(Protocol):
-    """Find out while training what does not move, and compute no motion for it."""
-
-    def at_rest(self) -> float:
-        """Return the share of the matter that has come to rest, in [0, 1]."""
-
-
-@runtime_checkable
 class HasMatter(Protocol):
     """Give the matter as points, for drawing, export and the next stage."""
 

@@ -107,8 +107,7 @@ def show_plan(made: dict, *, to_fit: bool = True) -> None:
     from forewarp.progress import time_text
 
     title = f"planned {'before, ' if made.get('found') else ''}in {time_text(made['seconds'])}"
-    caption = "± is two standard errors" if made["evidence"]["trials"] else "without trials: less sure"
-    table = Table(box=box.SIMPLE, title=title, caption=caption, title_justify="left", caption_justify="left")
+    table = Table(box=box.SIMPLE, title=title, title_justify="left")
     for name in ("effect", "choice", "because"):
         table.add_column(name, overflow="fold")
     for effect, decision in made["effects"].items():

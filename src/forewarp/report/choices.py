@@ -11,7 +11,7 @@ import shlex
 from collections.abc import Mapping, Sequence
 from itertools import count
 from pathlib import Path
-from statistics import fmean, mode
+from statistics import mode
 
 from forewarp.files import read_json, replace_file
 from forewarp.metrics.gain import FACTORS, Estimate, measure_effect
@@ -39,8 +39,8 @@ COSTS = {
     "memory": Column("GiB"),
 }
 COSTS |= {"parameters": Column("parameters (M)", 3), "steps": Column("steps", 0)}
-CHOICES = {"auto": "planned", "all_effects": "every effect", "full": "the paper's set", "base": "the preset"}
-WITHIN = 0.3  # dB of every effect at once that a planned run should come within, in less time
+CHOICES = {"auto": "planned", "base": "the preset", "all_effects": "every effect", "no_effects": "none"}
+LEAST = 0.1  # dB; a smaller difference counts as none
 
 
 def seconds_to(points: Sequence[Point], psnr: float) -> float | None:
@@ -221,17 +221,12 @@ def write_effects(folder: Path, out: Path) -> list[Path]:
         planned = [
             row for found in newest.where(ablation="auto").by("scene", "seed").values() for row in found
         ]
-        made = Runs(row for row in newest if row["config"].get("calls_for") is not None)
-        others = Runs(row for row in newest if row["config"].get("calls_for") is None)
         first = {row["scene"]: row["plan"].get("effects", {}) for row in reversed(planned)}
         text = rendered(
             "effects.md.j2",
             model=model,
-            within=WITHIN,
             machine=own.machines(),
-            specimens=[choices(made), called(row for row in planned if row in made)] if made else [],
-            others=choices(others) if others else None,
-            trials=trials(planned),
+            table=choices(newest),
             reasons=reasons(first),
             left_out=left_out,
         )
@@ -269,63 +264,41 @@ def reasons(effects: Mapping[str, Mapping]) -> Table:
 
 
 def choices(runs: Runs) -> Table:
-    """List for every scene the numbers of each choice, mean over seeds; then the mean over scenes."""
-    columns, present = ["scene", Column("seeds", 0)], [name for name in CHOICES if runs.where(ablation=name)]
-    for name in present:
-        minutes = [f"{minutes:g}" for minutes in runs.where(ablation=name).by("minutes") if minutes]
-        columns.append(CHOICES[name] + (f", {' or '.join(minutes)} min" if minutes else ""))
-    columns += [Column("planned - every effect", signed=True), Column("seconds to it", 0), Column("of", 0)]
+    """List for every scene the numbers of each choice, mean over seeds, and how the planned one is to the
+    best of the others: two standard errors of their differences by seed are noise.
+    """
+    present = [name for name in CHOICES if runs.where(ablation=name)]
+    columns = ["scene", Column("seeds", 0), Column("minutes", None), *(CHOICES[name] for name in present)]
+    columns += [Column("planned - best", signed=True), "", Column("planning, s", 1)]
     lines = []
     for scene, found in runs.by("scene").items():
-        planned, psnr = (
-            found.where(ablation="auto"),
-            [found.where(ablation=n).estimate("psnr") for n in present],
-        )
-        whole = {row["seed"]: row for row in found.where(ablation="all_effects")}
-        pairs = [(row, whole[row["seed"]]) for row in planned if row["seed"] in whole]
-        gain = measure_effect(pairs, "psnr")
-        curves = [(a["points"], b["points"]) for a, b in pairs if a["points"] and b["points"]]
-        times = [seconds_to(points, of_whole[-1].psnr - WITHIN) for points, of_whole in curves]
-        quick = None if None in times else Estimate.of(times)
-        of = Runs(every for _, every in pairs).mean("train")
+        by_choice = {name: found.where(ablation=name) for name in present}
+        planned = by_choice.get("auto", Runs())
+        means = {name: own.mean("psnr") for name, own in by_choice.items() if own and name != "auto"}
+        best = max(means, key=means.get) if means and planned else None
+        change, verdict = None, ""
+        if best is not None:
+            before = {row["seed"]: row for row in by_choice[best]}
+            pairs = [(row, before[row["seed"]]) for row in planned if row["seed"] in before]
+            change = measure_effect(pairs, "psnr")
+            verdict = _verdict(change, len(pairs)) + f", {CHOICES[best]}"
+        minutes = " or ".join(f"{minutes:g}" for minutes in found.by("minutes") if minutes)
         planning = Estimate.of([row["plan"]["seconds"] for row in planned if row["plan"]])
-        lines.append([scene, len(planned), *psnr, gain, quick, of, planning])
-    means = []
-    for cells in list(zip(*lines))[2:]:
-        values = [cell.mean if isinstance(cell, Estimate) else cell for cell in cells]
-        means.append(None if None in values else fmean(values))
-    lines += [["mean", None, *means]] if len(lines) > 1 else []
-    return Table([*columns, Column("planning, s", 0)], lines)
+        psnr = [by_choice[name].estimate("psnr") for name in present]
+        lines.append(
+            [scene, max(len(own) for own in by_choice.values()), minutes, *psnr, change, verdict, planning]
+        )
+    return Table(columns, lines)
 
 
-def called(planned: Sequence[Row]) -> Table:
-    """List for every plan the effects switched on, and the effects that the scene was made to call for."""
-    lines = []
-    for row in planned:
-        wanted = sorted(row["config"]["calls_for"])
-        on = sorted(name for name, decision in row["plan"].get("effects", {}).items() if decision["on"])
-        names = [", ".join(effects) or "nothing" for effects in (wanted, on)]
-        lines.append([row["scene"], row["seed"], *names, "as made" if on == wanted else "**otherwise**"])
-    right = sum(line[-1] == "as made" for line in lines)
-    columns = ["scene", Column("seed", 0), "made to call for", "planned", ""]
-    return Table(
-        columns, lines, f"{right} of {len(lines)} plans turn on what is called for and nothing else:"
-    )
-
-
-def trials(planned: Sequence[Row]) -> Table:
-    """List for every plan what its trials gained by each effect, ± two standard errors."""
-    gains = [(row, row["plan"].get("evidence", {}).get("trials", {})) for row in planned]
-    names = list(dict.fromkeys(name for _, of_plan in gains for name in of_plan))
-    lines = [
-        {name: Estimate(gain["psnr"], gain["noise"]) for name, gain in of_plan.items()} | row
-        for row, of_plan in gains
-        if of_plan
-    ]
-    caption = "dB on held-out training views that a trial with the effect has more; empty: not tried."
-    columns = {"scene": "scene", "seed": Column("seed", 0)}
-    columns |= {name: Column(name.replace("_", " "), signed=True) for name in names}
-    return Table.of(lines, columns, caption)
+def _verdict(change: Estimate | None, pairs: int) -> str:
+    """Say whether a planned run is above, within or below noise."""
+    if change is None:
+        return "no pair"
+    noise = max(LEAST, 2 * (change.deviation or 0.0) / math.sqrt(max(pairs, 1)))
+    if abs(change.mean) <= noise:
+        return f"within noise ({noise:.2f})"
+    return "above" if change.mean > 0 else "**below**"
 
 
 def write_search(folder: Path, out: Path) -> list[Path]:

@@ -234,7 +234,7 @@ def test_a_stage_and_its_queries_stay_on_their_device():
             optimizer.step()
         assert {t.device for t in method.state_dict().values()} == {GPU}
         assert len(method.means) > begun
-        assert method.at_rest() > 0
+        assert method.resting.any()
         snapshot = method.at(Moment(0.6, 2, 0))
         assert (snapshot.holds(Moment(0.6)), snapshot.holds(Moment(0.61))) == (True, False)
         for view in (View(camera), View(camera, torch.tensor([3, 4])), View(camera, crop=(1, 1, 4, 4))):

@@ -11,7 +11,7 @@ from forewarp.fields.curves import TrajectoryField
 from forewarp.methods.method import Start
 from forewarp.methods.voxel.effects import LearnedUpsampler, Motion, TrilinearUpsampler, UNet3d
 from forewarp.methods.voxel.model import VoxelMethod, VoxelSnapshot
-from forewarp.methods.voxel.structure import EFFECTS
+from forewarp.methods.voxel.structure import NAMES
 from forewarp.ops.grid import neighbour_pairs
 from forewarp.renderer import Marched
 from forewarp.scene.box import Lattice
@@ -38,10 +38,10 @@ LATTICE = Lattice(BOX, (5, 4, 6))
 FULL = forward_model(**EVERYTHING, trajectory=partial(TrajectoryField, bases=3, nodes=8, features=2))
 
 
-@pytest.mark.parametrize("effect", EFFECTS)
+@pytest.mark.parametrize("effect", NAMES)
 def test_a_stage_uses_the_effects_that_it_names(effect):
     method = built(FULL, LATTICE, effects=[effect])
-    assert {name for name in EFFECTS if getattr(method, name) is not None} == {effect}
+    assert {name for name in NAMES if getattr(method, name) is not None} == {effect}
 
 
 def test_a_stage_may_interpolate_instead():

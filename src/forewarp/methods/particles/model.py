@@ -6,7 +6,6 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
-from typing import ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -17,7 +16,7 @@ from forewarp.losses import IMAGE_LOSSES, robust
 from forewarp.methods.method import Method, Snapshot, Start, Step
 from forewarp.methods.particles import density, queries
 from forewarp.methods.particles.nodes import Nodes, Skinning, TimeOffsets, are_rows
-from forewarp.methods.particles.options import EFFECTS, Effects, Numbers, ParticlesPlanning, view_share
+from forewarp.methods.particles.options import EFFECTS, Effects, Numbers, view_share
 from forewarp.methods.particles.shared import begin_window, check_still, left_alone
 from forewarp.methods.particles.start import (
     compile_kernels,
@@ -69,7 +68,6 @@ class Particles(Method):
     asks = Asks(kind="pictures", straight=True)
     effects = EFFECTS
     on_cpu = "its kernels are the CPU's"
-    planning: ClassVar[ParticlesPlanning] = ParticlesPlanning()
 
     # Scene queries: see ``methods.method``.
     matter, bounds, trajectories = queries.matter, queries.bounds, queries.trajectories
@@ -206,10 +204,6 @@ class Particles(Method):
     def size(self) -> tuple[str, int]:
         """See ``Method``."""
         return "particles", len(self.means)
-
-    def at_rest(self) -> float:
-        """See ``HasRest``."""
-        return 0.0 if self.resting is None else float(self.resting.float().mean())
 
     def adopted(self) -> set[str]:
         """See ``Method``: nodes too are as many as a checkpoint says."""

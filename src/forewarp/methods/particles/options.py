@@ -1,4 +1,4 @@
-"""The options of particles: effects, the numbers of a stage, and how a plan decides on effects."""
+"""The options of particles: effects, and the numbers of a stage."""
 
 from __future__ import annotations
 
@@ -7,17 +7,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 
 from forewarp.fields.curves import KINDS
-from forewarp.methods.effect import DISAGREEMENT, Asked, CoarseTrials, Decision, Effect, Evidence
-from forewarp.methods.method import Method
+from forewarp.methods.effect import Effect, Evidence
 from forewarp.ops.backend import is_number
-from forewarp.scene.frame import Scene, Survey
-from forewarp.scene.view import Target
 
 _VIEWS = 100  # training images from which on more of them call for no more particles
-AT_REST = 0.1  # least share of particles at rest for the background to be worth having
-HARM = 0.2  # dB from which on the background costs too much
-HOPELESS = 0.5  # of ``AT_REST``: so little at rest with one seed is little with all
-RATES = {"means": 8e-3, "sh": 1e-3}  # learning rates of a trial
 
 
 @dataclass(frozen=True)
@@ -200,146 +193,11 @@ class Numbers:
         return max(4, round(self.nodes * math.sqrt(particles))), max(4, knots)
 
 
-OF_NODES = ("rotation", "background")  # nothing without motion
-STAND_INS = ("opacity_over_time", "color_over_time")  # for motion
-# In the order in which they are left out; but see ``order``.
 EFFECTS = (
-    Effect("motion", "spline", attribute="nodes"),
-    Effect("rotation", "nodes", attribute="nodes.rotations"),
-    Effect("background", "still", attribute="resting", rests=True),
-    Effect("opacity_over_time", "cosines"),
-    Effect("color_over_time", "cosines"),
-    Effect("view_dependence", "harmonics", attribute="sh"),
+    Effect("motion", attribute="nodes", of=Evidence.of_time),
+    Effect("rotation", attribute="nodes.rotations", needs="motion"),
+    Effect("background", attribute="resting", needs="motion"),
+    Effect("opacity_over_time", of=Evidence.of_time),
+    Effect("color_over_time", of=Evidence.of_time),
+    Effect("view_dependence", attribute="sh", of=Evidence.of_direction),
 )
-
-
-class ParticlesEvidence(Evidence):
-    """Evidence that decides the background by what rests, as it makes steps cheaper, not images better."""
-
-    def pays(self, effect: str) -> bool | None:
-        """Return whether an effect is missed; the background: whether much rests, at hardly any loss."""
-        if effect == "background" and effect in self.gains:
-            return self.at_rest.get(effect, 0.0) >= AT_REST and self.gains[effect].psnr >= -HARM
-        return super().pays(effect)
-
-    def hopeless(self, effect: str) -> bool:
-        """See ``Evidence``; the background: very little rests, or it costs accuracy beyond noise."""
-        if effect != "background":
-            return super().hopeless(effect)
-        gain = self.gains[effect]
-        return self.at_rest.get(effect, 0.0) < HOPELESS * AT_REST or gain.psnr + gain.noise < -HARM
-
-    def bound(self, effect: str) -> float:
-        """See ``Evidence``; less in longer trials, as what is rough falls with the root of the steps."""
-        return self.least / math.sqrt(longer(effect, self))
-
-    def of_trial(self, effect: str) -> str:
-        """Describe an effect's trial; the background: how much came to rest, too."""
-        trial = super().of_trial(effect)
-        if trial and effect == "background":
-            return f"; {self.at_rest.get(effect, 0.0):.1%} at rest, {AT_REST:.0%} asked{trial}"
-        return trial
-
-    def asked_of(self, effect: str) -> str:
-        """See ``Evidence``; the background may cost a little."""
-        return f"{-HARM} or more asked" if effect == "background" else super().asked_of(effect)
-
-
-class ParticlesPlanning:
-    """Decide the effects of particles (see ``methods.effect.Planning``)."""
-
-    effects = EFFECTS
-    # In a short trial effects make up for what is still rough: by up to 0.5 dB where they are not called for.
-    steps, trial_steps, least = 150, 700, 0.6
-
-    def evidence(self, pictures: Survey, **bounds) -> Evidence:
-        """Begin the evidence with what the images say."""
-        return ParticlesEvidence(pictures, **bounds)
-
-    def always(self, asked: Asked) -> tuple[Sequence[str], Sequence[str]]:
-        """Shape particles without any effect, so that all trials continue from the same; let them learn
-        faster than usual, as trials have few steps. (At the usual rate a still scene had 2.3 dB more with
-        motion than without after 1,000 steps, as nodes go faster than particles; after 3,000 it had 0.7 dB
-        less.)
-        """
-        rates = [f"stage.{asked.last}.lr.{name}={rate:g}" for name, rate in RATES.items()]
-        return [f"stage.{asked.coarse}.effects=[]"], rates
-
-    def coarse(self, evidence: Evidence, asked: Asked, trials: CoarseTrials) -> None:
-        """Begin with every effect that the images can show, and leave out one after the other."""
-        seen = {e.name: unseen(e.name, evidence) is None for e in EFFECTS}
-        on = {name: asked.choose(name) if seen[name] else "none" for name in seen}
-        trials.begin("coarse", _choices(on))
-        moves = asked.typed.get("model/motion") != "none"
-        for name in [name for name in order(evidence) if seen[name] and asked.trials]:
-            if f"model/{name}" in asked.typed or (name in OF_NODES and not moves):
-                continue
-            off = (name, *OF_NODES) if name == "motion" else (name,)
-            pays = trials.drop(name, _choices(dict.fromkeys(off, "none")), longer=longer(name, evidence))
-            moves = pays if name == "motion" else moves
-
-    def look(
-        self, evidence: Evidence, method: Method, scene: Scene, targets: Sequence[Target], asked: Asked
-    ) -> None:
-        """Add nothing: the coarse stage knows no effect."""
-
-    def decide(self, evidence: Evidence, asked: Asked) -> list[Decision]:
-        """Decide on all effects; what the user typed wins."""
-        decisions: dict[str, Decision] = {}
-        for effect in EFFECTS:
-            name, why = effect.name, unseen(effect.name, evidence)
-            if name in OF_NODES and not decisions["motion"].on:
-                why = "0 nodes: nothing moves"
-            on = why is None and self._called_for(name, evidence)
-            decisions[name] = asked.decided(name, on, why or _because(name, evidence))
-        return list(decisions.values())
-
-    def _called_for(self, name: str, evidence: Evidence) -> bool:
-        """Return what the trials say. Without trials nodes move and turn unless silhouettes deny it, and come
-        to rest where images are cut out.
-        """
-        moves = not evidence.cut_out or evidence.pictures.disagreement > DISAGREEMENT
-        alone = name in ("motion", "rotation") or (name == "background" and evidence.cut_out)
-        return evidence.calls_for(name, moves and alone)
-
-
-def order(evidence: Evidence) -> list[str]:
-    """Return the names of the effects in the order in which they are left out.
-
-    Where nothing is cut out, those that could stand in for motion go first: everything is visible all the
-    time, and fading in and out mimics it. (In the room motion gains 0.8 dB with them, 4 dB without.)
-    """
-    names = [effect.name for effect in EFFECTS]
-    if evidence.cut_out:
-        return names
-    return [*STAND_INS, *(name for name in names if name not in STAND_INS)]
-
-
-def longer(name: str, evidence: Evidence) -> int:
-    """Return how many times the usual steps trials of an effect have.
-
-    Those of view dependence are longer: after few steps it makes up for a shape that is still rough. (A matte
-    scene that stands still gains 0.4 dB by it after 700 steps, and 0.2 dB after 1,500, a glossy one 0.7 and
-    0.6.) So are those of motion and background where nothing is cut out, as the start is so rough that all
-    learn as fast at first. (The room gains 0.5 dB by motion after 700 steps, and 2.2 dB after 2,100.)
-    """
-    if name in ("motion", "background") and not evidence.cut_out:
-        return 3
-    return 2 if name == "view_dependence" else 1
-
-
-def unseen(name: str, evidence: Evidence) -> str | None:
-    """Say why the images cannot show an effect; None if they can."""
-    if name == "view_dependence":
-        return evidence.no_direction
-    return "1 time: nothing can be seen to change" if evidence.pictures.times < 2 else None
-
-
-def _because(name: str, evidence: Evidence) -> str:
-    if name == "motion":
-        return evidence.seen_to_move + evidence.of_trial(name)
-    return evidence.of_trial(name)[2:] or f"{evidence.pictures.times} times, and no trial"
-
-
-def _choices(choices: dict[str, str]) -> tuple[str, ...]:
-    return tuple(f"model/{name}={choice}" for name, choice in choices.items())

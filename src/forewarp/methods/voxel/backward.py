@@ -12,7 +12,7 @@ from forewarp.fields.grids import RadianceGrid
 from forewarp.fields.networks import mlp
 from forewarp.methods.method import Start
 from forewarp.methods.voxel.model import Factory, VoxelMethod, VoxelSnapshot
-from forewarp.methods.voxel.planning import EFFECTS
+from forewarp.methods.voxel.structure import EFFECTS
 from forewarp.ops.encode import encoded_size, positional_encoding
 from forewarp.ops.grid import dilate
 from forewarp.scene.box import Box, Lattice

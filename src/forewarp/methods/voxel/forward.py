@@ -19,7 +19,7 @@ from forewarp.methods.voxel.effects import (
     sparsify,
 )
 from forewarp.methods.voxel.model import Factory, VoxelMethod, VoxelSnapshot
-from forewarp.methods.voxel.planning import EFFECTS, VoxelPlanning
+from forewarp.methods.voxel.structure import EFFECTS
 from forewarp.scene.view import Moment
 
 
@@ -42,7 +42,6 @@ class ForwardWarp(VoxelMethod):
     """
 
     effects = EFFECTS
-    planning = VoxelPlanning()
 
     def __init__(
         self,

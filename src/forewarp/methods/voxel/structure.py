@@ -9,13 +9,21 @@ import torch
 from torch import Tensor
 
 from forewarp.fields.grids import EMPTY, VoxelGrid
+from forewarp.methods.effect import Effect, Evidence
 from forewarp.methods.method import FRACTION, Start, check_number, steps_of
 from forewarp.methods.rows import renew_parameters
 from forewarp.ops.grid import dilate, trilinear
 from forewarp.scene.box import Box, Lattice
 from forewarp.scene.frame import visual_hull
 
-EFFECTS = ("motion", "view_dependence", "upsampler", "inpainter", "background")
+EFFECTS = (
+    Effect("motion", of=Evidence.of_time),
+    Effect("background", of=Evidence.of_background, needs="motion"),  # one grid holds all that stands still
+    Effect("view_dependence", of=Evidence.of_direction),
+    Effect("inpainter", needs="motion"),  # nothing opens
+    Effect("upsampler"),
+)
+NAMES = tuple(effect.name for effect in EFFECTS)
 
 
 @dataclass(frozen=True)
@@ -25,8 +33,7 @@ class VoxelStage:
     Args:
         num_voxels: ``[[fraction, count], ...]``: about ``count`` voxels in the box from ``fraction`` on.
         background_num_voxels: as ``num_voxels``, for the static background's grid over the scene's box.
-        effects: effects of the model to use in this stage, some of ``motion, view_dependence, upsampler,
-            inpainter, background``.
+        effects: effects of the model to use in this stage, some of ``NAMES``.
         upsample: interpolate by this factor instead of the model's up-sampler; None: use the model's.
         carry: continue with the grids of the stage before, if it was a voxel method; False: use its box only.
         start: voxels that are active at first: ``box`` (all), ``hull`` (the visual hull; needs alpha), or
@@ -56,7 +63,7 @@ class VoxelStage:
 
     num_voxels: Sequence[Sequence[float]]
     background_num_voxels: Sequence[Sequence[float]] = ((0.0, 262144),)
-    effects: Sequence[str] = EFFECTS
+    effects: Sequence[str] = NAMES
     upsample: float | None = None
     carry: bool = True
     start: str = "box"
@@ -80,9 +87,9 @@ class VoxelStage:
         where = f"stage.{self.name}"
         for key in ("num_voxels", "background_num_voxels", *(["bases"] if self.bases else [])):
             steps_of(f"{where}.{key}", getattr(self, key))
-        if not set(self.effects) <= set(EFFECTS):
+        if not set(self.effects) <= set(NAMES):
             raise ValueError(
-                f"{where}.effects: expected some of {', '.join(EFFECTS)}, but got {list(self.effects)}"
+                f"{where}.effects: expected some of {', '.join(NAMES)}, but got {list(self.effects)}"
             )
         if self.start not in ("auto", "box", "hull"):
             raise ValueError(f"{where}.start: expected auto, box or hull, but got '{self.start}'")

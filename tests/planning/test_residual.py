@@ -1,0 +1,43 @@
+"""What time and direction explain of errors."""
+
+import math
+
+import pytest
+import torch
+
+from forewarp.planning.residual import cells_of, explained
+
+VIEWS, CELLS = 40, 30
+
+
+@pytest.fixture(scope="module")
+def seen():
+    """Of every cell in every view: directions, cosines over time, cells, views, and noise (P, 3)."""
+    generator = torch.Generator().manual_seed(0)
+    cells, views = torch.arange(CELLS).repeat(VIEWS), torch.arange(VIEWS).repeat_interleave(CELLS)
+    directions = torch.nn.functional.normalize(torch.randn(VIEWS, 3, generator=generator).double(), dim=-1)
+    times = torch.rand(VIEWS, 1, generator=generator).double()
+    over_time = torch.cos(math.pi * times * torch.arange(1, 3))
+    noise = 0.01 * torch.randn(len(cells), 3, generator=generator).double()
+    return directions[views], over_time[views], cells, views, noise
+
+
+@pytest.mark.parametrize("moves", [False, True])
+def test_what_causes_the_errors_explains_them(seen, moves):
+    directions, over_time, cells, views, noise = seen
+    cause = over_time if moves else directions
+    errors = noise + (cause[:, :1] * torch.linspace(-0.3, 0.3, CELLS).double()[cells][:, None])
+    by_direction, by_time = (explained(x, errors, cells, views) for x in (directions, over_time))
+    assert (by_time > 0.7, by_time < 0.05) == (moves, not moves)
+    assert (by_direction > 0.7, by_direction < 0.05) == (not moves, moves)
+
+
+def test_noise_is_explained_by_nothing(seen):
+    directions, over_time, cells, views, noise = seen
+    assert explained(directions, noise, cells, views) < 0
+    assert explained(over_time, noise, cells, views) < 0
+
+
+def test_cells_are_a_twentieth_of_the_extent():
+    places = torch.stack([torch.linspace(0, 2, 401), torch.zeros(401), torch.zeros(401)], -1).double()
+    assert 20 <= int(cells_of(places).max()) + 1 <= 22
