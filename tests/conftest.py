@@ -10,8 +10,23 @@ gc.set_threshold(100_000, 20, 20)  # composing a configuration makes many object
 
 import pytest
 import torch
+from hydra._internal import defaults_list
+from hydra.core.config_store import ConfigStore
 
 from tests.support.commands import call, fitted_run
+
+of_interpolations = defaults_list._create_interpolation_map
+
+
+def _where_there_are_any(overrides, defaults, self_added):
+    """Make the map of interpolated defaults, a quarter of a composition, where there are such defaults."""
+    if any(not default.is_self() and default.is_interpolation() for default in defaults):
+        return of_interpolations(overrides, defaults, self_added)
+    return None
+
+
+defaults_list._create_interpolation_map = _where_there_are_any
+ConfigStore.__deepcopy__ = lambda store, memo: store  # for each composition; what it loads is copied, too
 
 
 @pytest.fixture(scope="session", autouse=True)

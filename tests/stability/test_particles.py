@@ -110,9 +110,8 @@ def test_thousands_on_one_pixel(place, logit):
 def test_of_a_crowded_tile_the_nearest_are_drawn(place):
     """The kernel looks at 32,768 of a tile, the reference at all."""
     kernel = place.type == "cpu" and backend.numba_installed()
-    count, looked_at = (
-        (36_000, 32_768) if kernel else (17_000, 17_000)
-    )  # in more than one piece, 2^20 pairs each
+    # The reference: in more than one piece of 2^20 pairs.
+    count, looked_at = (36_000, 32_768) if kernel else (17_000, 17_000)
     generator = torch.Generator().manual_seed(0)
     numbers = torch.full((count, 10), 0.05)
     numbers[:, :2] = 8 * torch.rand(count, 2, generator=generator)
