@@ -23,7 +23,7 @@ class Watch:
 class FakeViewer:
     """Renders grey images; each takes ``cost`` seconds a pixel, of a clock that stands otherwise."""
 
-    rows, note, can_follow = 400, "", True
+    rows, aspect, note, can_follow = 400, 1.0, "", True
 
     def __init__(self, watch=None, cost=0.0):
         self.watch, self.cost, self.scene = watch or Watch(), cost, ball_scene(frames=4)

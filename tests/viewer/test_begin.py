@@ -1,5 +1,6 @@
 """Where pages begin, and how they are sent splats; where there is no browser to test them in."""
 
+import math
 import sys
 from types import SimpleNamespace
 
@@ -8,7 +9,7 @@ import pytest
 import torch
 
 from forewarp.scene.cloud import Ellipsoids
-from forewarp.viewer.begin import begin_at, silent, splat_arrays, vertical_fov
+from forewarp.viewer.begin import begin_at, fitted_fov, silent, splat_arrays, vertical_fov
 from tests.support.browser import NEEDED, chromium
 from tests.support.tiny_scene import ball_scene
 
@@ -33,6 +34,16 @@ def test_a_page_begins_where_a_camera_stands_and_turns_about_a_point_ahead(side,
     np.testing.assert_allclose(seen.look_at, center + away * ahead)
     assert seen.fov == pytest.approx(2 * np.arctan(0.5 * camera.height / camera.fy))
     assert server.ups == [(0, 0, 1)]
+
+
+@pytest.mark.parametrize(("width", "height"), [(400, 400), (1000, 400), (390, 844)])
+def test_a_canvas_shows_the_whole_image(width, height):
+    camera = ball_scene().train[0].camera
+    down = math.tan(0.5 * fitted_fov(camera, width, height))
+    across = down * width / height
+    assert down >= 0.5 * camera.height / camera.fy - 1e-9
+    assert across >= 0.5 * camera.width / camera.fx - 1e-9
+    assert min(down / (camera.height / camera.fy), across / (camera.width / camera.fx)) == pytest.approx(0.5)
 
 
 def test_splats_keep_their_shape_in_half_precision():

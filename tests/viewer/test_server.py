@@ -20,9 +20,10 @@ import viser
 
 from forewarp.scene.cloud import Ellipsoids
 from forewarp.viewer import server as server_module
+from forewarp.viewer.begin import fitted_fov, vertical_fov
 from forewarp.viewer.page import Page
 from forewarp.viewer.queue import Cancelled
-from forewarp.viewer.rendering import SceneRenderer, Viewer, ViewState
+from forewarp.viewer.rendering import SceneRenderer, Viewer, ViewState, first_frame
 from forewarp.viewer.server import check_address
 from forewarp.viewer.session import Session
 from tests.contract.fitting import stage_of
@@ -240,8 +241,24 @@ def client():
     """Viser's server as the client of a page whose camera stands at the origin."""
     server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
     server.camera = SimpleNamespace(on_update=lambda act: act, wxyz=np.eye(4)[0], position=(0, 0, 0), fov=0.5)
+    server.camera.image_width, server.camera.image_height = 900, 640
     yield server
     server.stop()
+
+
+def test_home_shows_the_whole_first_image_as_does_a_phone_from_the_start(client, tmp_path):
+    viewer = Viewer(ball_data().scene)
+    first = first_frame(viewer.scene).camera
+    page, camera = Page(viewer, client, tmp_path), client.camera
+    assert camera.fov == 0.5  # where the server let it begin
+    camera.position = np.ones(3)
+    page.go_home()
+    np.testing.assert_allclose(camera.position, first.center)
+    assert camera.fov == pytest.approx(vertical_fov(first))
+    camera.image_width, camera.image_height = 390, 844
+    Page(viewer, client, tmp_path)
+    assert camera.fov == pytest.approx(fitted_fov(first, 390, 844))
+    assert camera.fov > vertical_fov(first)
 
 
 def test_controls_offer_what_the_method_of_a_stage_can_show(modules, client, tmp_path):

@@ -312,7 +312,8 @@ def test_an_image_is_no_wider_than_a_screen_whatever_a_browser_tells():
     for canvas, size in (
         ((1280, 720), (1280, 720)),
         ((3_000_000, 10), (2880, 1)),
-        ((2, 3_000_000), (1, 720)),
+        ((2, 3_000_000), (1, 2880)),
+        ((400, 800), (720, 1440)),  # square images, whole on a canvas half as wide as high
     ):
         session.page.canvas = lambda canvas=canvas: canvas
         assert session.full_size() == size

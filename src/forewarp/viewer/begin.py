@@ -26,6 +26,15 @@ def vertical_fov(camera: Camera) -> float:
     return 2 * math.atan(0.5 * camera.height / camera.fy)
 
 
+def fitted_fov(camera: Camera, width: float, height: float) -> float:
+    """Return the angle from top to bottom, radians, by which a canvas shows a camera's whole image.
+
+    A canvas narrower than the image, as a phone's, shows more above and below it.
+    """
+    across = 0.5 * camera.width / camera.fx
+    return 2 * math.atan(max(0.5 * camera.height / camera.fy, across * height / width))
+
+
 def begin_at(server, pose: Tensor, fov: float, focus: Tensor, up: Tensor, away: float) -> None:
     """Let the pages of viser's ``server`` begin at a camera, with the scene upright.
 

@@ -15,17 +15,19 @@ from viser.transforms import SO3
 
 from forewarp.drawing.images import hues, png_bytes, to_bytes
 from forewarp.evaluation.layers import LAYERS
+from forewarp.scene.camera import Camera
 from forewarp.scene.cloud import Ellipsoids
 from forewarp.scene.frame import spread
-from forewarp.viewer.begin import splat_arrays, vertical_fov
+from forewarp.viewer.begin import fitted_fov, splat_arrays, vertical_fov
 from forewarp.viewer.queue import Cancelled
-from forewarp.viewer.rendering import SPLATS, Viewer, turning_axis
+from forewarp.viewer.rendering import SPLATS, Viewer, first_frame, turning_axis
 from forewarp.viewer.session import MAX_VIDEO_SECONDS, MIN_VIDEO_SECONDS, Session
 
 _MOVED = 1e-3  # of the distance to the pivot: a camera that went farther has left the training view
 _ARRIVAL = 0.5  # seconds in which a camera that was sent somewhere may still tell where it was
 _JPEG_QUALITY = {True: 92, False: 80}  # at rest and while moving
 _SPEEDS = ("0.1", "0.25", "0.5", "1", "2", "4")
+_NARROW = 600  # pixels of a page's width below which controls begin folded, as on a phone
 _MAX_CAMERAS = 200  # training cameras that are drawn
 _FOLLOW = "follow the point that I click"
 _ABOUT_SPLATS = "*splats*: drawn by the browser, with one colour from all sides and no trajectories"
@@ -44,6 +46,7 @@ class Page:
         self.viewer, self.client, self.folder = viewer, client, folder
         self.session = Session(viewer, self)
         self._splats, self._sent = None, float("-inf")
+        self._is_wide = self.canvas()[0] >= _NARROW
         self._cameras: list[viser.CameraFrustumHandle] = []
         self._showing_cameras = threading.Lock()
         self.status = client.gui.add_markdown("...")
@@ -55,6 +58,8 @@ class Page:
         self._add_training_images()
         self._add_video()
         self.adapt()
+        if not self._is_wide:
+            self.go_home()
 
         @client.camera.on_update
         async def _(camera: viser.CameraHandle) -> None:
@@ -124,7 +129,18 @@ class Page:
         self._sent = time.monotonic()
         self.image.value = index
         frame = self.viewer.scene.train[index]
-        pose = frame.camera.camera_to_world
+        self._stand_at(frame.camera, vertical_fov(frame.camera))
+        self.show_time(frame.time)
+        self.show_playing(False)
+
+    def go_home(self) -> None:
+        """Stand where the first test image was taken, else the first training image, and show all of it."""
+        camera = first_frame(self.viewer.scene).camera
+        self.show_training_view(None)
+        self._stand_at(camera, fitted_fov(camera, *self.canvas()))
+
+    def _stand_at(self, of_image: Camera, fov: float) -> None:
+        pose = of_image.camera_to_world
         center, ahead = pose[:3, 3], pose[:3, 2]
         distance = max(float((self.viewer.focus - center) @ ahead), 1e-3 * self.viewer.scene.box.diagonal)
         camera = self.client.camera
@@ -132,9 +148,7 @@ class Page:
             camera.up_direction = turning_axis(pose, self.viewer.up).numpy()
             camera.position = center.numpy()
             camera.look_at = (center + distance * ahead).numpy()
-            camera.fov = vertical_fov(frame.camera)
-        self.show_time(frame.time)
-        self.show_playing(False)
+            camera.fov = fov
 
     def _camera_moved(self, camera: viser.CameraHandle) -> None:
         pose = torch.eye(4, dtype=torch.float64)
@@ -197,6 +211,7 @@ class Page:
         with gui.add_folder("Time"):
             self.time = gui.add_slider("time", 0.0, 1.0, 0.001, round(session.state.time, 3))
             self.play = gui.add_button("play")
+            home = gui.add_button("home")
             speed = gui.add_dropdown("speed", _SPEEDS, initial_value="1")
             loop = gui.add_checkbox("loop", True)
 
@@ -207,12 +222,13 @@ class Page:
 
         on_edit(self.time, lambda time: self._change(time=float(time)))
         on_press(self.play, toggle)
+        on_press(home, self.go_home)
         on_edit(speed, lambda speed: session.set_speed(float(speed)))
         on_edit(loop, lambda loop: setattr(session, "loop", loop))
 
     def _add_channels(self) -> None:
         gui, scene, session = self.client.gui, self.client.scene, self.session
-        with gui.add_folder("Show"):
+        with gui.add_folder("Show", expand_by_default=self._is_wide):
             chosen = session.state.channel
             self.channel = gui.add_dropdown("show", self.viewer.channels, initial_value=chosen)
             self.about_splats = gui.add_markdown(_ABOUT_SPLATS)
@@ -241,7 +257,7 @@ class Page:
 
     def _add_training_images(self) -> None:
         gui, last = self.client.gui, len(self.viewer.scene.train) - 1
-        with gui.add_folder("Training images"):
+        with gui.add_folder("Training images", expand_by_default=self._is_wide):
             gui.add_markdown("Choose one, or click its camera, for truth | prediction | error.")
             self.image = gui.add_slider("image", 0, max(last, 1), 1, 0)
             # Over two images side by side there is no one place for a camera.

@@ -17,7 +17,7 @@ from forewarp.evaluation.layers import LAYERS, layer_of
 from forewarp.evaluation.trajectories import Trajectories
 from forewarp.methods.method import HasEllipsoids, HasLayers, HasMatter, HasTrajectories, Method, Snapshot
 from forewarp.scene.camera import Camera, focus_point, mean_up
-from forewarp.scene.frame import Scene
+from forewarp.scene.frame import Frame, Scene
 from forewarp.scene.view import Moment, Rendering, View
 from forewarp.training.module import DynamicSceneModule
 from forewarp.viewer.begin import vertical_fov
@@ -68,8 +68,13 @@ class ViewState:
     @classmethod
     def first(cls, scene: Scene) -> ViewState:
         """Stand where the first test image was taken, at its time; without one, the first training image."""
-        frame = (scene.test or scene.train)[0]
+        frame = first_frame(scene)
         return cls(frame.camera.camera_to_world, vertical_fov(frame.camera), frame.time)
+
+
+def first_frame(scene: Scene) -> Frame:
+    """Return the first test image; without one, the first training image."""
+    return (scene.test or scene.train)[0]
 
 
 def camera_of(state: ViewState, width: int, height: int, scene: Scene) -> Camera:
@@ -281,6 +286,7 @@ class Viewer:
         self.scene, self.renderers = scene, list(renderers)
         cameras = [frame.camera for frame in scene.train]
         self.rows = rows or max(_MIN_FULL_ROWS, *(camera.height for camera in cameras))
+        self.aspect = max(camera.width / camera.height for camera in cameras)
         # The point that pages' cameras turn about, and the upward direction, both (3,).
         self.focus, self.up = focus_point(cameras), mean_up(cameras)
         self.queue = RenderQueue()

@@ -126,13 +126,15 @@ class Session:
 
     def full_size(self) -> tuple[int, int]:
         """Width and height of an image at rest: the canvas's shape, with at most ``viewer.rows`` rows and
-        ``WIDEST`` times as many columns, whatever a browser tells.
+        ``WIDEST`` times as many columns, whatever a browser tells. A canvas narrower than the images, which
+        shows more above and below them, has more rows, up to ``WIDEST`` times.
 
         On a slow machine the browser tells a canvas of half the pixels that it has.
         """
         width, height = self.page.canvas()
-        most = WIDEST * self.viewer.rows
-        rows = max(1, min(2 * height, self.viewer.rows, most * height // width))
+        most, narrow = WIDEST * self.viewer.rows, self.viewer.aspect * height / width
+        rows = round(self.viewer.rows * min(WIDEST, max(1.0, narrow)))
+        rows = max(1, min(2 * height, rows, most * height // width))
         return max(1, min(most, round(width * rows / height))), rows
 
     def _advance(self) -> None:
