@@ -52,7 +52,7 @@ bench: ## time every operator, a step and a frame, into docs/performance.md (a q
 
 accuracy-time: ## accuracy of each choice against training time [MODEL=forward DATA= SCENES= MINUTES= CHANGES= SEEDS=3]
 price-list: ## what each choice costs and brings, on the vehicle and real scenes [MODEL=forward DATA= SCENES="a b" MINUTES= CHANGES=]
-ablations: ## what each part of the paper's method brings, at equal minutes and at equal steps [MINUTES= STEPS= SEEDS=3 OUT= SMALL=1]
+ablations: ## what each part of the paper's method brings, at equal minutes and at equal steps, or at rest [PRESET=compact DATA= MINUTES= STEPS= SEEDS=3 OUT= SMALL=1]
 effects: ## planned effects of model=forward against all effects [DATA= SCENES="a b" MINUTES= SEEDS=]; plans of MODEL=particles
 accuracy-time price-list ablations effects:
 	$(call REPRODUCE,$@)

@@ -179,12 +179,13 @@ def test_every_section_of_numbers_composes_and_instantiates(model, preset, exper
 
 @pytest.mark.slow
 @pytest.mark.parametrize("model", IN_SMALL)
-def test_compact_differs_from_faithful_in_sizes_alone(model):
+def test_compact_differs_from_faithful_in_sizes_and_ends_alone(model):
     faithful, compact = (
         OmegaConf.to_container(composed("data.scene=x", f"model={model}", f"preset={preset}"), resolve=True)
         for preset in ("faithful", "compact")
     )
     sizes = {"share", "num_voxels", "background_num_voxels", "patches", "curriculum"}
+    sizes |= {"start_alpha", "lr_hold", "lr_final_factor"}
     for config in (faithful, compact):
         for part in ("preset", "budget", "run", "modules", "plan"):
             config.pop(part, None)

@@ -21,7 +21,7 @@ from hydra_plugins.forewarp_one_at_a_time import changed
 from tests.support.configs import ROOT, composed
 
 PAPER = {"dnerf": 24, "hypernerf": 12, "nhr": 12, "lego_complete": 9, "ablation_modules": 60}
-PAPER |= {"ablation_losses": 32, "resolution": 16, "methods": 24}
+PAPER |= {"ablation_losses": 32, "ablation_at_rest": 10, "resolution": 16, "methods": 24}
 OTHERS = {
     "accuracy_time",
     "effects",
@@ -49,6 +49,11 @@ def jobs_of(sweep, *words):
     return changed(jobs, sweeper.get("scenes", [""]))
 
 
+def with_changes(sweep):
+    """The overrides of every job with every change that the sweep lists."""
+    return changed(jobs_of(sweep), composed(f"sweeps={sweep}", hydra=True).hydra.sweeper.changes)
+
+
 def job_of(sweep, *overrides):
     """A job's config, put together as far as it goes without its data."""
     config = composed(f"sweeps={sweep}", *overrides, hydra=True)
@@ -74,7 +79,7 @@ def test_no_sweep_is_forgotten():
 @pytest.mark.slow
 @pytest.mark.parametrize(("sweep", "count"), PAPER.items())
 def test_a_sweep_has_its_jobs(sweep, count):
-    jobs = jobs_of(sweep)
+    jobs = with_changes(sweep)
     assert len(jobs) == len({tuple(job) for job in jobs}) == count
     config = job_of(sweep, *jobs[-1])
     assert config.absent == "skip"
@@ -85,7 +90,7 @@ def test_a_sweep_has_its_jobs(sweep, count):
 def test_every_scene_and_choice_composes_and_has_a_folder_of_its_own():
     seen = set()
     for sweep in (*PAPER, "effects"):
-        jobs = some_of(jobs_of(sweep), seen)
+        jobs = some_of(with_changes(sweep), seen)
         assert len({hashed(job_of(sweep, *job)).run for job in jobs}) == len(jobs), sweep
 
 

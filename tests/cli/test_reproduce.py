@@ -63,6 +63,15 @@ def test_ablations_are_run_for_equal_minutes_and_equal_steps():
         assert in_room == [sweep for sweep in alike if "scene=counterpart_hypernerf" in sweep]
 
 
+def test_ablations_at_rest_take_a_lane_a_seed_and_end_by_the_presets_steps():
+    sweeps, ((*_, out),) = planned("ablations PRESET=compact DATA=there")
+    assert out == "out=docs/results"
+    common = {"sweeps=ablation_at_rest", "score=null", "paths.runs=runs/ablations", "paths.scenes=there"}
+    assert sweeps == [common | {"seed=0"}, common | {"seed=1"}]
+    sweeps, _ = planned("ablations PRESET=compact SEEDS=4,7 STEPS=30")
+    assert [sweep >= {"budget.iterations=30", seed} for sweep, seed in zip(sweeps, ("seed=4", "seed=7"))]
+
+
 def test_changes_are_compared_with_the_reference():
     (reference, changed), _ = planned('accuracy-time MODEL=forward CHANGES="preset.rays=1024,2048"')
     assert changed == reference | {"preset.rays=1024,2048"}
@@ -90,6 +99,7 @@ def test_small_runs_are_kept_apart():
         ("tables SCENES=hook", "scenes: expected data=<folder that holds dnerf/> beside it"),
         ("tables SWEEPS=dnerf", "sweeps: expected all or ablations without data=, but got dnerf"),
         ("tables DATA=there SWEEPS=methods", "scenes: expected scenes=hook,... beside sweeps=methods"),
+        ("ablations PRESET=compact MINUTES=1", "expected none beside preset=compact"),
         ("ablations DATA=there", "forewarp-reproduce tables data=there sweeps=ablations"),
         ("price-list", "data: expected data=<folder"),
         ("price-list DATA=there MODEL=nerf", "which have a price list, but got nerf"),
@@ -146,6 +156,10 @@ def test_the_small_form_writes_the_page_by_make(tmp_path):
             "effects/results/effects-particles.md",
         ),
         (f"ablations SEEDS=1 MORE='ablation=full,no_tv {TINY}'", "results/ablation.md"),
+        (
+            f"ablations PRESET=compact SEEDS=1 MORE='scene=counterpart_dnerf preset=compact {TINY}'",
+            "results/ablation.md",
+        ),
         (f"tables SEEDS=1 METHODS=nerf MORE='{TINY}'", "paper/results/paper.md"),
     ],
 )

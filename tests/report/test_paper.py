@@ -451,6 +451,41 @@ def test_the_page_says_which_of_the_papers_orders_hold(tmp_path):
     assert len(table.splitlines()) == 1 + 2 * 7
 
 
+def test_runs_at_rest_stand_above_what_the_page_has_already(tmp_path):
+    def rest(variant, seed, psnr, method="forward"):
+        config = {"preset": {"name": "compact"}, "model": {"name": method}, "budget": {"iterations": 9}}
+        config["budget"]["minutes"] = None
+        metrics = {"protocol": {"dataset": "dnerf", "synthetic": True}, "test": {"all": {"psnr": psnr}}}
+        about = {"scene": "vehicle", "curve": ((0, 20.0), (80, 25.0), (90, 25.5), (100, 25.1))}
+        write_run(tmp_path / "rest", variant, seed, **about, config=config, metrics=metrics)
+
+    for seed in range(2):
+        part(tmp_path / "first", "full", seed, 25.0)
+        part(tmp_path / "first", "no_tv", seed, 24.0)
+        rest("full", seed, 23.0 + seed)
+        rest("no_inpainter", seed, 22.5 + seed)
+        rest("base", seed, 24.0 + seed, "backward")
+    out = tmp_path / "out"
+    write_ablation(tmp_path / "first", out)
+    before = (out / "ablation.md").read_text()
+    assert "## At rest" not in before
+    for _ in range(2):
+        written = write_ablation(tmp_path / "rest", out)
+        assert [path.name for path in written] == ["ablation.md", "ablation-at-rest.csv"]
+        text = (out / "ablation.md").read_text()
+        assert text.count("## At rest") == 1
+        assert text.index("## At rest") < text.index("## In short")
+        assert text[text.index("## In short") :] == before[before.index("## In short") :]
+    section = text.split("## At rest")[1].split("## ")[0]
+    ours, without, backward = rows_of(section, "vehicle")
+    assert ours[1:6] == ["Ours", "", "23.50 ± 0.71", "", ""]
+    assert without[2:7] == ["-0.90", "23.00 ± 0.71", "-0.50 ± 0.00", "holds", "+0.10 ± 0.00"]
+    assert backward[2:6] == ["", "24.50 ± 0.71", "+1.00 ± 0.00", ""]
+    assert "vehicle 0.00 dB" in section
+    write_ablation(tmp_path / "first", out)  # the others anew
+    assert (out / "ablation.md").read_text() == text
+
+
 def test_a_row_with_fewer_seeds_says_so(tmp_path):
     for seed, whole in enumerate((25.0, 26.0)):
         part(tmp_path, "full", seed, whole)

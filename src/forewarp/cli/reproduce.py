@@ -5,12 +5,14 @@ stops no other; finished jobs are skipped, so the same command continues. `make 
   forewarp-reproduce tables                          every method on procedural counterparts, no data needed
   forewarp-reproduce tables data=DATASETS scenes=hook,lego methods=all minutes=5 seeds=3
   forewarp-reproduce price-list data=DATASETS model=forward
+  forewarp-reproduce ablations preset=compact data=DATASETS   each part at rest, on hook and a counterpart
   forewarp-reproduce ablations small=1                        the same runs, a few steps each: does it work?
 
 What it runs:
   demo            the procedural vehicle by three methods, two at a time, beside each other, and a video
   tables          the paper's tables; with data=FOLDER on real scenes (FOLDER/dnerf/hook ...)
-  ablations       what each part of the paper's method brings on counterparts, at equal minutes and steps
+  ablations       what each part of the paper's method brings on counterparts, at equal minutes and steps;
+                  with preset=compact where training has come to rest, two seeds at a time
   accuracy-time   accuracy of each choice against training time, on one scene
   price-list      what each choice costs and brings, on the procedural vehicle and real scenes
   effects         what a scene calls for, the preset, every effect and none
@@ -21,7 +23,7 @@ Keys (capitals do, too):
   scenes=A,B        of the D-NeRF scenes
   methods=A,B|all   tables: in place of a sweep's own
   model=NAME        accuracy-time, price-list, effects: particles or forward
-  preset=NAME       demo, fast or faithful
+  preset=NAME       demo, fast or faithful; ablations: compact
   minutes=N         of training a run;  steps=N  optimiser steps a run
   seeds=3           seeds 0, 1 and 2;  seeds=4,7  these
   sweeps=A,B|all    tables: in place of the default; ablations: both sweeps of ablations
@@ -239,6 +241,8 @@ def _counterparts(sweeps: str, base: Sweep, keys: Keys) -> list[list[Sweep]]:
 
 def ablations(keys: Keys) -> Job:
     """Leave out each part of the paper's method on three counterparts, at equal minutes and equal steps."""
+    if keys.preset == "compact":
+        return _at_rest(keys)
     if keys.data or keys.methods:
         raise ValueError(
             "data, methods: expected none, as ablations are of model=forward on counterparts, but got some; "
@@ -249,7 +253,7 @@ def ablations(keys: Keys) -> Job:
         _counterparts("ablations", [*common, *until, *OF_ABLATIONS], keys)
         for until in (_until(keys.minutes or "2.5"), _until(steps=keys.steps or "600"))
     )
-    then = [["report", "kind=ablation", "runs=runs/ablations", f"out={keys.out or 'docs/results'}"]]
+    then = [_ablation_page(keys)]
     if keys.small:  # without the scene that costs most; the two lanes take about as long
         lanes = [
             [sweep for lane in lanes for sweep in lane if ROOM[0] not in sweep]
@@ -258,6 +262,24 @@ def ablations(keys: Keys) -> Job:
         return Job(lanes, then, int(keys.jobs), small=("0.02", "8", "5"))
     lanes = [first + second for first, second in zip(by_minutes, by_steps, strict=True)]
     return Job(lanes, then, int(keys.jobs))
+
+
+def _at_rest(keys: Keys) -> Job:
+    """Leave out each part where training has come to rest; a lane for each seed."""
+    if keys.minutes or keys.methods or keys.scenes:
+        raise ValueError("minutes, methods, scenes: expected none beside preset=compact, but got some")
+    base = ["sweeps=ablation_at_rest", "score=null", "paths.runs=runs/ablations"]
+    base += _until(steps=keys.steps or "1") if keys.steps or keys.small else []
+    base += [f"paths.scenes={keys.data}"] if keys.data else []
+    base += [f"views={keys.views}"] if keys.views else []
+    seeds = keys.seeds or "2"
+    drawn = words(seeds) if "," in seeds else [str(seed) for seed in range(int(seeds))]
+    lanes = [[[*base, f"seed={seed}"]] for seed in drawn]
+    return Job(lanes, [_ablation_page(keys)], int(keys.jobs))
+
+
+def _ablation_page(keys: Keys) -> list[str]:
+    return ["report", "kind=ablation", "runs=runs/ablations", f"out={keys.out or 'docs/results'}"]
 
 
 def _compared(keys: Keys, base: Sweep) -> list[Sweep]:

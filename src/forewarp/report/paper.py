@@ -7,13 +7,14 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
 from statistics import fmean
 from typing import NamedTuple
 
+import numpy as np
 import yaml
 
 from forewarp.files import MOST_CONFIG, read_text, replace_file
@@ -21,7 +22,7 @@ from forewarp.metrics.gain import Estimate, pooled_deviation
 from forewarp.metrics.registry import metric_of
 from forewarp.report import figures
 from forewarp.report.choices import every_run
-from forewarp.report.results import COUNTERPART, KINDS, Row, Runs, portable, read_runs
+from forewarp.report.results import COUNTERPART, KINDS, Point, Row, Runs, portable, read_runs
 from forewarp.report.tables import Cell, Column, Difference, Section, Table, rendered
 
 PAPER = Path(__file__).with_name("paper.yaml")  # the printed numbers
@@ -37,6 +38,9 @@ COSTS = (Column("training, s a run", 0), Column("GiB"), Column("parameters (M)",
 COSTS += (Column("protocol"), Column("device"))  # what a measured row says beside its scores
 LEAST = 0.1  # dB that a difference must exceed: of two seeds both may err alike
 ORDERS = ("holds", "within noise", "reversed", "one seed")
+AT_REST = "compact"  # the preset whose training comes to rest
+OF_REST = re.compile(r"^## At rest$.*?(?=^## |\Z)", re.MULTILINE | re.DOTALL)  # on the page
+LAST = 0.2  # of a run's training: what its curve gains there tells whether it was at rest
 
 
 class Group(NamedTuple):
@@ -471,10 +475,12 @@ def _figures(runs: Runs, out: Path, curves: Path | None) -> list[Section]:
 
 
 def write_ablation(folder: Path, out: Path, published: Path = PAPER) -> list[Path]:
-    """Write ``ablation.md`` and ``ablation.csv`` (every run).
+    """Write ``ablation.md`` and ``ablation.csv`` (every run), of runs at rest ``ablation-at-rest.csv``.
+
+    The part of a page already there that these runs do not fill, at rest or not, stays.
 
     Args:
-        folder: of runs of ``sweeps=ablation_modules`` and ``ablation_losses``.
+        folder: of runs of ``sweeps=ablation_modules``, ``ablation_losses`` and ``ablation_at_rest``.
         out: see above.
         published: file of the printed numbers.
 
@@ -486,9 +492,26 @@ def write_ablation(folder: Path, out: Path, published: Path = PAPER) -> list[Pat
     # Tables that take the method apart; a table scene by scene repeats another.
     tables = [table for table in paper if not table.means and len(table.parts) > 1]
     known = {row.variant for table in tables for row in table.parts}
-    runs = Runs(run for run in runs if run["ablation"] in known)
-    if not runs:
+    rest = Runs(r for r in runs.where(preset=AT_REST) if r["ablation"] in known or r["method"] == "backward")
+    runs = Runs(run for run in runs if run["ablation"] in known and run["preset"] != AT_REST)
+    if not runs and not rest:
         raise ValueError(f"{folder}: expected runs of ablations, but got none; make some with make ablations")
+    page, files = out / "ablation.md", [out / "ablation.md"]
+    earlier = read_text(page) if page.is_file() else ""
+    kept = OF_REST.search(earlier)
+    part = rendered("at_rest.md.j2", **_at_rest(tables, rest)) if rest else kept[0] if kept else ""
+    text = OF_REST.sub("", earlier if earlier and not runs else _page(tables, runs, left_out))
+    before, heading, after = text.partition("\n## ")
+    replace_file(page, f"{before.rstrip()}\n\n{part.strip()}\n{heading}{after}" if part else text)
+    for found, name in ((runs, "ablation.csv"), (rest, "ablation-at-rest.csv")):
+        if found:
+            replace_file(out / name, every_run(found).csv())
+            files.append(out / name)
+    return files
+
+
+def _page(tables: Sequence[PaperTable], runs: Runs, left_out: Sequence[str]) -> str:
+    """Make the page of all runs that are not at rest."""
     numbers = numbered(runs)
     orders: dict[str, list[str]] = {}  # of each budget, what became of the paper's order in each row
     sections = [section for table in tables for section in _ablated(table, runs, orders, numbers)]
@@ -500,11 +523,58 @@ def write_ablation(folder: Path, out: Path, published: Path = PAPER) -> list[Pat
     caption = "Rows of all tables below, by what became of the paper's order:"
     used = Runs(run for run in runs if any(run["ablation"] in table.variants for table in tables))
     about = _about(sections, used, numbers)
-    sections = [Section("In short", [Table(columns, lines, caption)]), *sections, about]
+    sections = [Section("In short", [Table(columns, lines, caption)]), *sections, about] if runs else []
     sections += [Section("Left out", facts=left_out)] if left_out else []
-    replace_file(out / "ablation.md", rendered("ablation.md.j2", sections=sections, least=LEAST))
-    replace_file(out / "ablation.csv", every_run(runs).csv())
-    return [out / "ablation.md", out / "ablation.csv"]
+    return rendered("ablation.md.j2", sections=sections, least=LEAST)
+
+
+def _at_rest(tables: Sequence[PaperTable], runs: Runs) -> dict:
+    """Make what ``at_rest.md.j2`` shows: what each part changes where training has come to rest."""
+    columns = ["scene", "row of the paper", Column("paper, dB", signed=True), "PSNR"]
+    columns += [Column("difference", signed=True), "order", Column("last fifth", signed=True)]
+    columns += [Column("steps", 0, spread=False), Column("minutes", 1)]
+    lines: list[list[Cell]] = []
+    noises = []
+    for table in tables:
+        for group, own, _ in _groups(table, runs) if "no_upsampling" in table.variants else ():
+            printed, scene = _printed_changes(table, group), ", ".join(group.scenes)
+            rows = [(row.name, row.variant, own.where(ablation=row.variant)) for row in table.parts]
+            rows.append(("a backward warp (not in the paper)", None, own.where(method="backward")))
+            psnr = [by_seed(of_row, group, "psnr") for *_, of_row in rows]
+            changes = [[of[seed] - psnr[0][seed] for seed in of if seed in psnr[0]] for of in psnr]
+            noise = pooled_deviation(changes[1:])
+            noises.append(f"{scene} " + ("unknown" if noise is None else f"{noise:.2f} dB"))
+            for (name, variant, of_row), scores, change in zip(rows, psnr, changes, strict=True):
+                if scores:
+                    change = Estimate.of(change) if variant != "full" else None
+                    order = verdict(change.mean, printed.get(variant), noise) if change else None
+                    late = Estimate.of([g for run in of_row if (g := late_gain(run["points"])) is not None])
+                    line = [scene, name, printed.get(variant), Estimate.of(list(scores.values())), change]
+                    took = of_row.mean("train")
+                    lines.append([*line, order, late, of_row.mean("steps"), took and took / 60])
+    return {"table": Table(columns, lines), "noise": "; ".join(noises), "facts": facts(runs, numbered(runs))}
+
+
+def late_gain(points: Sequence[Point]) -> float | None:
+    """Return by how much PSNR (dB) rises in the last fifth of a run's training; None without a curve."""
+    if len(points) < 2:
+        return None
+    seconds, psnr = zip(*((point.seconds, point.psnr) for point in points))
+    return psnr[-1] - float(np.interp((1 - LAST) * seconds[-1], seconds, psnr))
+
+
+def _groups(table: PaperTable, runs: Runs) -> Iterator[tuple[Group, Runs, bool]]:
+    """Give each scene, or mean of scenes, of which there are runs, with these and whether they are of a
+    counterpart.
+    """
+    for made in (False, True):
+        of_kind = runs.where(counterpart=made)
+        shown = counterpart(table, of_kind) if made else table
+        for group in shown.groups if shown else ():
+            own = Runs(run for run in of_kind if run["scene"] in group.scenes)
+            own = Runs(run for run in own if dataset_of(run) == group.dataset)
+            if scenes := tuple(scene for scene in group.scenes if own.where(scene=scene)):
+                yield group._replace(scenes=scenes), own, made
 
 
 def _ablated(
@@ -512,19 +582,15 @@ def _ablated(
 ) -> list[Section]:
     """Make a section for each scene, or mean of scenes, on which the table's rows were measured."""
     sections = []
-    for made in (False, True):
-        of_kind = runs.where(counterpart=made)
-        shown = counterpart(table, of_kind) if made else table
-        for group in shown.groups if shown else ():
-            own = Runs(run for run in of_kind if run["scene"] in group.scenes)
-            scenes = tuple(scene for scene in group.scenes if own.where(scene=scene))
-            changes = _changes(table, group._replace(scenes=scenes), own, orders) if scenes else None
-            if changes is not None:
-                title = f"{table.title}: {group.name}"
-                title += f", of which {', '.join(scenes)}" if scenes != group.scenes else ""
-                title += f", {scenes[0]}" if made and group.name != scenes[0] else ""
-                used = Runs(run for run in own if run["ablation"] in table.variants)
-                sections.append(Section(title, [changes], facts(used, numbers), table.notes))
+    for group, own, made in _groups(table, runs):
+        changes = _changes(table, group, own, orders)
+        if changes is not None:
+            whole = next((of.scenes for of in table.groups if of.name == group.name), group.scenes)
+            title = f"{table.title}: {group.name}"
+            title += f", of which {', '.join(group.scenes)}" if not made and group.scenes != whole else ""
+            title += f", {group.scenes[0]}" if made and group.name != group.scenes[0] else ""
+            used = Runs(run for run in own if run["ablation"] in table.variants)
+            sections.append(Section(title, [changes], facts(used, numbers), table.notes))
     return sections
 
 
