@@ -531,7 +531,7 @@ def _page(tables: Sequence[PaperTable], runs: Runs, left_out: Sequence[str]) -> 
 def _at_rest(tables: Sequence[PaperTable], runs: Runs) -> dict:
     """Make what ``at_rest.md.j2`` shows: what each part changes where training has come to rest."""
     columns = ["scene", "row of the paper", Column("paper, dB", signed=True), "PSNR"]
-    columns += [Column("difference", signed=True), "order", Column("last fifth", signed=True)]
+    columns += [Column("difference", signed=True), "order", "canonical", Column("last fifth", signed=True)]
     columns += [Column("steps", 0, spread=False), Column("minutes", 1)]
     lines: list[list[Cell]] = []
     noises = []
@@ -551,7 +551,8 @@ def _at_rest(tables: Sequence[PaperTable], runs: Runs) -> dict:
                     late = Estimate.of([g for run in of_row if (g := late_gain(run["points"])) is not None])
                     line = [scene, name, printed.get(variant), Estimate.of(list(scores.values())), change]
                     took = of_row.mean("train")
-                    lines.append([*line, order, late, of_row.mean("steps"), took and took / 60])
+                    line += [order, of_row.estimate("psnr_canonical"), late]
+                    lines.append([*line, of_row.mean("steps"), took and took / 60])
     return {"table": Table(columns, lines), "noise": "; ".join(noises), "facts": facts(runs, numbered(runs))}
 
 
