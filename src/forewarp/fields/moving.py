@@ -159,15 +159,6 @@ class GaussiansSnapshot:
         opacity = 1 - through[:, None]
         return torch.where(opacity > _SHOWN, mean / opacity, torch.nan)
 
-    def gathered(self, view: View, of_pixels: Tensor) -> Tensor:
-        """Return the sums over a view's pixels of what they have (R, 3), times what each shows of a Gaussian,
-        for every Gaussian (N, 3).
-        """
-        with torch.enable_grad():
-            instead = torch.zeros_like(self.gaussians.means).requires_grad_()
-            drawn = self._drawn(view, instead)[0]
-            return torch.autograd.grad(drawn, instead, of_pixels)[0]
-
     def share(self, view: View, rows: Tensor) -> Tensor:
         """Return the share (R,) in [0, 1] of each pixel that is rows (N,) bool, as nothing hides it: render
         these white, all others black.

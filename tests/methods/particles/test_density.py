@@ -8,17 +8,9 @@ import torch
 
 from forewarp.data.module import SceneDataModule
 from forewarp.methods.particles import density
-from forewarp.methods.particles.density import (
-    _product,
-    _quaternions,
-    come_to_rest,
-    not_missed,
-    renew,
-    too_near,
-)
+from forewarp.methods.particles.density import _product, _quaternions, come_to_rest, renew, too_near
 from forewarp.methods.rows import take_rows
 from forewarp.ops.gaussians import moved, rotations
-from forewarp.scene.view import Moment, View
 from tests.support.particles import BARE, EVERY, look, module_with, small_data
 
 DATA = small_data()
@@ -182,34 +174,6 @@ def test_what_does_not_move_rests_where_it_was_and_as_it_was_turned(half):
     ends = [placed(method, time)[0] for time in (0.0, 1.0)]
     assert torch.equal(ends[0][rests], ends[1][rests])
     assert float((ends[1] - ends[0])[~rests].norm(dim=-1).max()) > 0.3
-
-
-def test_motion_that_no_image_shows_is_not_missed_and_rests(half):
-    method, moves = half[0].method, half[1]
-    links, weights = method.skinning.links.long(), method.skinning.weights()
-    follows = links.gather(1, weights.argmax(1, keepdim=True))[:, 0]
-    hidden = moves & (method.nodes.positions[:, 1] > method.nodes.positions[:, 1].median())
-    method.opacity.data[hidden[follows]] = -12.0
-    own = []
-    for frame in method.looks:  # as particles show themselves now
-        moment, view = Moment(frame.time, camera=frame.camera_id), View(frame.camera)
-        drawn = method.at(moment).render(view, torch.zeros(3)).rgb.clamp(0, 1).mul(255).round().byte()
-        image = torch.cat([drawn, torch.full_like(drawn[:, :1], 255)], 1).reshape(*frame.load().shape)
-        own.append(replace(frame, load=lambda image=image: image))
-    method.looks = own
-    before = method.nodes.translations.detach().clone()
-    found = not_missed(method, moves, [0.0, 0.5, 1.0])
-    assert torch.equal(method.nodes.translations, before)
-    assert not bool(method.nodes.stopped.any())
-    missed = moves & ~found
-    assert bool(missed.any())
-    assert bool(hidden.any())
-    assert not bool((missed & hidden).any())
-    assert not bool(found[~moves].any())
-    most = float(method.nodes.motion_range([0.0, 0.5, 1.0]).max())
-    come_to_rest(method, most / 2.5)
-    assert bool(method.nodes.stopped[hidden].all())
-    assert not bool(method.nodes.stopped[missed].any())
 
 
 def test_what_rests_keeps_resting_through_steps_and_density_control(half):

@@ -11,7 +11,6 @@ from torch import Tensor
 from forewarp.methods.particles.shared import left_alone
 from forewarp.methods.rows import take_rows
 from forewarp.ops.gaussians import moved, rotations
-from forewarp.scene.view import Moment, View
 
 if TYPE_CHECKING:
     from forewarp.methods.particles.model import Particles
@@ -25,7 +24,6 @@ _NEAREST, _NEARER = 0.02, 0.6  # share of an image's particles; of the farthest 
 _TIMES = 16  # at which opacity over time and motion are looked at
 _MOST_OPAQUE = 6.0  # logit: at 17 float32 has no gradient left, and what is opaque there can never fade
 _FOLLOWS = 1e-3  # weight of a node below which its motion shows nowhere
-_DOUBTFUL = 3.0  # of the range within which nodes come to rest: up to there, if no image misses their motion
 
 
 def too_near(order: Tensor, distances: Tensor) -> Tensor:
@@ -181,8 +179,7 @@ def pixel_width(covered: float) -> float:
 @torch.no_grad()
 def come_to_rest(particles: Particles, least: float) -> None:
     """Stop nodes that stay within ``least`` (world units) of their mean position, with what their turning
-    moves beside them counted in, or within a few times that, if images do not miss their motion; particles
-    that follow only stopped nodes stop, too.
+    moves beside them counted in; particles that follow only stopped nodes stop, too.
 
     Such a particle is put where it was on average, turned as it was on average, and its shares of nodes
     become 0: it costs no motion any more. A stopped node stays where it was on average, too, as others may
@@ -190,11 +187,7 @@ def come_to_rest(particles: Particles, least: float) -> None:
     """
     nodes = particles.nodes
     times = torch.linspace(*particles.ends, _TIMES).tolist()
-    wander = nodes.motion_range(times)
-    rests, doubtful = wander < least, (wander < _DOUBTFUL * least) & ~nodes.stopped
-    if particles.looks and bool((doubtful & ~rests).any()):
-        rests |= not_missed(particles, doubtful, times)
-    nodes.stop(rests, times)
+    nodes.stop(nodes.motion_range(times) < least, times)
     follows = particles.skinning.weights() > _FOLLOWS
     still = left_alone(particles.shared, particles.resting)
     free = ~(follows & ~nodes.stopped[particles.skinning.links.long()]).any(-1) & ~still
@@ -207,37 +200,6 @@ def come_to_rest(particles: Particles, least: float) -> None:
     particles.quaternions[free] = _product(_quaternions(left @ right), particles.quaternions[free])
     particles.resting[free] = True
     particles.skinning.release(free)
-
-
-@torch.no_grad()
-def not_missed(particles: Particles, which: Tensor, times: list[float]) -> Tensor:
-    """Return those of some nodes (M,) bool whose motion images do not miss: with all of these stopped, what
-    follows them is shown no worse than images show everything on average now.
-
-    What has no texture may wander unseen; it then shows from where no image looks.
-
-    Cost: about that of three steps for each of ``particles.looks``.
-    """
-    nodes, shares, black = particles.nodes, particles.skinning.weights(), particles.means.new_zeros(3)
-    follows = particles.skinning.links.long().gather(1, shares.argmax(1, keepdim=True))[:, 0]
-    moves, everything = shares.amax(1) > _FOLLOWS, black.new_zeros(3)
-    sums = black.new_zeros(len(which), 3)  # squared error now, that if stopped, and pixels
-    for frame in particles.looks:
-        moment, view = Moment(frame.time, camera=frame.camera_id), View(frame.camera)
-        now = particles.at(moment)
-        with nodes.as_if_stopped(which, times):
-            stopped = particles.at(moment)
-        rgba = frame.load().to(black).reshape(-1, 4) / 255
-        truth = rgba[:, :3] * rgba[:, 3:]
-        errors = [(one.render(view, black).rgb - truth).square().sum(-1) for one in (now, stopped)]
-        of_pixels = torch.stack([*errors, torch.ones_like(errors[0])], -1)
-        if frame.load_valid is not None:
-            of_pixels *= frame.load_valid().to(black).reshape(-1, 1)
-        shown = now.gathered(view, of_pixels)
-        sums.index_add_(0, follows[moves], shown[moves])
-        everything += shown.sum(0)
-    average = everything[0] / everything[2].clamp(min=1e-9)
-    return which & (sums[:, 1] <= average * sums[:, 2])
 
 
 def _quaternions(matrices: Tensor) -> Tensor:

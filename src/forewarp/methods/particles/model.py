@@ -36,10 +36,8 @@ from forewarp.ops.gaussians import (
 )
 from forewarp.ops.nodes import pull_nodes
 from forewarp.scene.cloud import Cloud
-from forewarp.scene.frame import spread
 from forewarp.scene.view import Asks, Batch, Moment, Observation
 
-_LOOKS = 12  # images that tell whether the motion of nodes is missed
 _FEWEST_TIMES = 8  # of training, for learned corrections of them
 # Parameters and buffers with a row for each particle; those of effects that are off are None.
 _ROWS = ("means", "scales", "quaternions", "opacity", "colors", "sh", "color_over_time", "opacity_over_time")
@@ -102,7 +100,6 @@ class Particles(Method):
         self.ends = min(times), max(times)
         self.progress = self.decay = self.hidden_decay = 0.0
         self.shown_now: list[Tensor] = []  # which particles each image of this step showed
-        self.looks = [start.scene.train[i] for i in spread(self.views, _LOOKS)]
 
         self.box = start.scene.box if self.stage.shell and not start.scene.has_alpha else None
         values = self._first_values(start)

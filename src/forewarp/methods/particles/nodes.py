@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 
 import torch
 from torch import Tensor, nn
@@ -200,17 +199,6 @@ class Nodes(nn.Module):
         for value in self._coefficients():
             stays = torch.einsum("mkc,k->mc", value[which], mean)
             value[which] = stays[:, None] if self.curve.kind == "spline" else 0.0
-
-    @contextmanager
-    def as_if_stopped(self, which: Tensor, times: list[float]) -> Iterator[None]:
-        """Let nodes (M,) bool ``stop`` for a while."""
-        kept = [value.detach().clone() for value in (self.stopped, *self._coefficients())]
-        self.stop(which, times)
-        try:
-            yield
-        finally:
-            for value, before in zip((self.stopped, *self._coefficients()), kept):
-                value.data.copy_(before)
 
     def rows(self) -> list[str]:
         """Return the names of what has a row for each node."""

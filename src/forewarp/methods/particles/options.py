@@ -23,9 +23,8 @@ class Effects:
         view_dependence: degree 1 to 3 of the spherical harmonics by which colour depends on direction.
         color_over_time, opacity_over_time: number of cosines over time of each particle's colour and opacity.
         background: share of the scene's extent. Nodes that move (and, by rotating, move what is beside them)
-            no farther than that from their mean position, or than a pixel, come to rest, and so do those that
-            move up to thrice as far if images do not miss it; particles that follow no others need no nodes
-            any more.
+            no farther than that from their mean position, or than a pixel, come to rest; particles that
+            follow no others need no nodes any more.
 
     Raises:
         ValueError: naming the key of a choice that there is not.
