@@ -72,6 +72,11 @@ def test_few_images_that_show_no_change_say_nothing(changes, rests):
     assert Evidence(replace(QUIET, **changes)).silhouettes_rest is rests
 
 
+def test_a_budget_too_small_to_tell_changes_nothing():
+    assert on(PARTICLES, OF_PARTICLES, QUIET) == set(OF_PARTICLES)
+    assert Evidence(QUIET).of_time()[1].endswith("but the budget is too small to tell")
+
+
 def test_each_reason_has_its_number():
     reasons = {d.effect: d.because for d in decide(PARTICLES, Evidence(PICTURES), OF_PARTICLES, {})}
     assert reasons["motion"] == "50 times; a static shape explains all but 2.0% of the silhouettes"

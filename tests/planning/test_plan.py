@@ -67,10 +67,13 @@ def test_a_plan_is_made_once_told_and_fitted(forewarp, ok, scenes, monkeypatch, 
 
 
 @pytest.mark.slow
-def test_auto_fits_a_scene_that_stands_still_without_what_it_does_not_call_for(forewarp, ok, in_tmp):
+def test_auto_fits_a_scene_that_stands_still_without_what_it_does_not_call_for(
+    forewarp, ok, in_tmp, monkeypatch
+):
     sizes = {"size": 24, "frames": 40, "test_views": (1, 1, 0), "val_views": 0, "samples_per_pixel": 1}
     synthesize(in_tmp / "scenes" / "still", motion="still", **sizes)
-    short = ["budget.iterations=300", "budget.minutes=null", "evaluate=false", "run=still"]
+    monkeypatch.setattr("forewarp.planning.plan.SHARE", 1.0)
+    short = ["budget.iterations=720", "budget.minutes=null", "evaluate=false", "run=still"]
     typed = ["model=particles", *TINY, "data.root=scenes", "data.scene=still", *short]
     ok("train", *typed, "effects=auto")
     made = yaml.safe_load((in_tmp / "still" / "plan.yaml").read_text())

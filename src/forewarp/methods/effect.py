@@ -14,10 +14,10 @@ CUT_OUT = 0.001  # share of transparent pixels below which the scene has a backg
 STILL = 0.001
 ENOUGH = 40  # images from which on it counts that nothing is seen to change
 NARROW = 15.0  # degrees between the most different cameras below which direction cannot be observed
-# Least shares of what a short still fit leaves over that time, and direction, explain. By time scenes that
-# stand still have -0.07 to -0.02, one whose light moves 0.17 to 0.35; by direction a matte one 0.06, a glossy
-# one 0.22.
-BY_TIME, BY_DIRECTION = 0.05, 0.1
+# Least shares of what a short still fit leaves over that time, and direction, explain. After ``still_steps``
+# time explains -0.07 to -0.03 of scenes that stand still and 0.13 to 0.24 where the light moves; direction
+# 0.06 to 0.1 of a matte scene and 0.22 to 0.32 of a glossy one.
+BY_TIME, BY_DIRECTION = 0.05, 0.15
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ class Evidence:
             return True, f"{why}; without silhouettes, motion is taken for granted"
         why += f"; a static shape explains all but {self.pictures.disagreement:.1%} of the silhouettes"
         if self.residual is None:
-            return True, why
+            return True, why + (", but the budget is too small to tell" if self.silhouettes_rest else "")
         share = self.residual.by_time
         return share > BY_TIME, f"{why}, and time {max(share, 0):.0%} of what a still fit leaves over"
 

@@ -104,6 +104,7 @@ class Method(nn.Module):
         numbers: its own keys of a stage.
         asks: what a batch should hold.
         effects: its optional parts (see ``methods.effect``).
+        still_steps: steps after which a fit without effects shows what it can't explain, for a plan.
         grows: dotted names of the parameters and buffers whose number of rows may change during training;
             they adopt a checkpoint's.
         on_cpu: why ``trainer=auto`` should leave a GPU aside, in a few words; None: it should not.
@@ -115,6 +116,7 @@ class Method(nn.Module):
     numbers: ClassVar[Sequence[str]] = ()
     asks: Asks = Asks()
     effects: ClassVar[Sequence] = ()
+    still_steps: ClassVar[int] = 150
     grows: ClassVar[Sequence[str]] = ()
     on_cpu: ClassVar[str | None] = None
     betas: ClassVar[tuple[float, float]] = (0.9, 0.99)

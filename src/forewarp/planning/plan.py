@@ -11,7 +11,8 @@ from hydra import compose
 from omegaconf import DictConfig, open_dict
 
 from forewarp.data.checks import remarks
-from forewarp.methods.effect import Effect, Evidence, Residual, decide
+from forewarp.methods.effect import Evidence, Residual, decide
+from forewarp.methods.method import Method
 from forewarp.planning.plan_file import read_plan, write_plan
 from forewarp.planning.residual import residual
 from forewarp.runs.build import build_run
@@ -24,7 +25,8 @@ from forewarp.training.stages import Run
 
 # Keys that do not change what a run computes.
 NOT_OF_IT = ("effects", "plan", "run", "evaluate", "sheets", "views", "reduce", "planned", "trust", "score")
-SHARE, SECONDS = 0.05, 5.0  # most of the run's budget, and seconds, that the short fit takes
+SHARE = 0.1  # of the run's budget that the short fit may take
+ENOUGH = 0.9  # of its steps that it must reach for its errors to count: stages end by the clock, too
 CAPTURES = ("cut_out", "video")  # options of the group ``capture`` that images can tell apart
 
 
@@ -45,8 +47,8 @@ def make_plan(config: DictConfig, overrides: Sequence[str]) -> dict:
     typed = [override for override in overrides if key_of(override).split(".")[0] not in NOT_OF_IT]
     run = build_run(config)
     run.check_device()  # before a folder is made
-    effects = getattr(getattr(run.model, "func", run.model), "effects", ())
-    if not effects:
+    method = getattr(run.model, "func", run.model)
+    if not getattr(method, "effects", ()):
         raise ValueError(
             f"model: expected a method with effects to choose from, but {config.model.name} has none; use "
             "model=particles, model=forward or model=backward, or leave out effects=auto"
@@ -67,26 +69,27 @@ def make_plan(config: DictConfig, overrides: Sequence[str]) -> dict:
             )
         return made | {"file": str(file), "found": True}
     begin = time.perf_counter()
-    made = _decided(config, typed, folder, run, effects)
+    made = _decided(config, typed, folder, run, method)
     made |= {"seconds": round(time.perf_counter() - begin, 1), "of": asked, "asked": list(overrides)}
     write_plan(file, made)
     return made | {"file": str(file)}
 
 
-def _decided(config: DictConfig, typed: list[str], folder: Path, run: Run, effects: Sequence[Effect]) -> dict:
+def _decided(config: DictConfig, typed: list[str], folder: Path, run: Run, method: type[Method]) -> dict:
     """Return the plan, without seconds: overrides, effects with reasons, evidence."""
-    evidence, names = Evidence(survey(run.datamodule.scene)), [effect.name for effect in effects]
+    evidence, names = Evidence(survey(run.datamodule.scene)), [effect.name for effect in method.effects]
     chosen = {key_of(override): override.partition("=")[2] for override in typed}
     base = list(typed)
     if config.capture in CAPTURES and "capture" not in chosen:
         base.append(f"capture={CAPTURES[0] if evidence.cut_out else CAPTURES[1]}")
-    if evidence.silhouettes_rest:
+    budget = short(config.budget, method.still_steps)
+    if evidence.silhouettes_rest and budget is not None:
         still = [f"model/{name}=none" for name in names if f"model/{name}" not in chosen]
-        evidence = replace(evidence, residual=_still_fit(merged(base, still), folder / "still"))
+        evidence = replace(evidence, residual=_still_fit(merged(base, still), budget, folder / "still"))
     choices = compose("train", base, return_hydra_config=True).hydra.runtime.choices
     preset = {name: choices.get(f"model/{name}") or "none" for name in names}
     of_user = {name: chosen[f"model/{name}"] for name in names if f"model/{name}" in chosen}
-    decisions = decide(effects, evidence, preset, of_user)
+    decisions = decide(method.effects, evidence, preset, of_user)
     # The method and all choices: defaults may change.
     overrides = [f"model={choices['model']}", *base[len(typed) :]]
     overrides += [f"model/{d.effect}={d.choice}" for d in decisions if d.effect not in of_user]
@@ -98,34 +101,36 @@ def _decided(config: DictConfig, typed: list[str], folder: Path, run: Run, effec
     }
 
 
-def _still_fit(overrides: list[str], folder: Path) -> Residual:
-    """Fit the run without effects for a moment, and measure the errors that it leaves."""
+def _still_fit(overrides: list[str], budget: Mapping, folder: Path) -> Residual | None:
+    """Fit the run without effects for a moment, and measure the errors that it leaves; None if the time was
+    too short to tell.
+    """
     config = compose("train", without_switched_off(overrides))
     with open_dict(config):
         config.run, config.effects, config.evaluate = str(folder), "given", False
-        config.logger, config.callbacks = None, {}
-        config.budget = short(config.budget)
+        config.logger, config.callbacks, config.budget = None, {}, budget
     run = build_run(config)
     run.tell = lambda line: None
     with session(run, config):
         module = run.fit().to(run.device)
-        seconds = sum(done["seconds"] for done in run.finished().values())
+        done = run.finished().values()
+        if sum(stage["steps"] for stage in done) < ENOUGH * budget["iterations"]:
+            return None
+        seconds = sum(stage["seconds"] for stage in done)
         return residual(module.method, run.datamodule.targets("train"), round(seconds, 2))
 
 
-def short(budget: Mapping) -> dict:
-    """Return the budget of the short fit.
+def short(budget: Mapping, steps: int) -> dict | None:
+    """Return the budget of a short fit of so many steps; None if the run's budget is too small for it.
 
-    >>> short({"clock": "wall", "minutes": 1, "iterations": None})
-    {'clock': 'wall', 'minutes': 0.05, 'iterations': None}
-    >>> short({"clock": "wall", "minutes": 60, "iterations": 500})
-    {'clock': 'wall', 'minutes': 0.08333333333333333, 'iterations': 25}
+    >>> short({"clock": "wall", "minutes": 2, "iterations": None}, 700)
+    {'clock': 'wall', 'minutes': 0.2, 'iterations': 700}
+    >>> short({"clock": "wall", "minutes": None, "iterations": 500}, 700)
     """
-    minutes, iterations = SECONDS / 60, budget["iterations"]
-    if budget["minutes"] is not None:
-        minutes = min(minutes, SHARE * budget["minutes"])
-    iterations = None if iterations is None else max(2, round(SHARE * iterations))
-    return {**budget, "minutes": minutes, "iterations": iterations}
+    minutes, iterations = budget["minutes"], budget["iterations"]
+    if iterations is not None and SHARE * iterations < steps:
+        return None
+    return {**budget, "minutes": None if minutes is None else SHARE * minutes, "iterations": steps}
 
 
 def refuse(config: DictConfig, typed: Sequence[str]) -> None:

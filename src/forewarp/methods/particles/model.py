@@ -66,7 +66,7 @@ class Particles(Method):
     terms = ("photo", *IMAGE_LOSSES, "depth", "rigid", "smooth")
     numbers = tuple(key for key in Numbers.__dataclass_fields__ if key != "name")
     asks = Asks(kind="pictures", straight=True)
-    effects = EFFECTS
+    effects, still_steps = EFFECTS, 700  # a step is of one image
     on_cpu = "its kernels are the CPU's"
 
     # Scene queries: see ``methods.method``.
