@@ -53,7 +53,7 @@ bench: ## time every operator, a step and a frame, into docs/performance.md (a q
 accuracy-time: ## accuracy of each choice against training time [MODEL=forward DATA= SCENES= MINUTES= CHANGES= SEEDS=3]
 price-list: ## what each choice costs and brings, on the vehicle and real scenes [MODEL=forward DATA= SCENES="a b" MINUTES= CHANGES=]
 ablations: ## what each part of the paper's method brings, at equal minutes and at equal steps, or at rest [PRESET=compact DATA= MINUTES= STEPS= SEEDS=3 OUT= SMALL=1]
-effects: ## planned effects of model=forward against all effects [DATA= SCENES="a b" MINUTES= SEEDS=]; plans of MODEL=particles
+effects: ## what scenes call for, beside the preset, every effect and none [MODEL=forward DATA= SCENES="a b" MINUTES= SEEDS=]
 accuracy-time price-list ablations effects:
 	$(call REPRODUCE,$@)
 reproduce-tables: ## the paper's tables, measured beside published [DATA= METHODS="dnerf ndvg", or all; PRESET= SCENES= MINUTES= SEEDS=3 SWEEPS=all]

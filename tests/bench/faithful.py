@@ -42,7 +42,7 @@ from tests.stability.report import replace_section, table
 from tests.support.configs import composed
 
 PAGE = Path("docs/results/faithful-step.md")
-# Without particles, whose faithful is fast.
+# Without particles, which nobody has published.
 METHODS = ("forward", "backward", "nerf", "tnerf", "dnerf", "nerfies", "hypernerf", "neural_volumes")
 METHODS += ("ndvg", "tineuvox_s", "tineuvox_b")
 FIELDS = ("method", "of", "rays", "flop", "seconds", "bytes", "parameters", "steps", "failed")

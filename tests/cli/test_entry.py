@@ -112,6 +112,7 @@ def test_options_of_ones_own_stand_beside_ours(ok, in_tmp):
             ["--multirun", "hydra/sweeper=one_at_a_time", "hydra.sweeper.changes=[]"],
             "at least one change, but got []",
         ),
+        (["preset=compact"], "preset: expected demo, fast or faithful, as compact is of model=forward"),
         (["model=tnerf", "ablation=base"], "model: expected forward or backward or particles, which base is"),
         (["model=tnerf", "+stage.coarse.share=1"], "stage.coarse: expected a stage of the method, but got"),
     ],

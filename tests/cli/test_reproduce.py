@@ -69,7 +69,8 @@ def test_ablations_at_rest_take_a_lane_a_seed_and_end_by_the_presets_steps():
     common = {"sweeps=ablation_at_rest", "score=null", "paths.runs=runs/ablations", "paths.scenes=there"}
     assert sweeps == [common | {"seed=0"}, common | {"seed=1"}]
     sweeps, _ = planned("ablations PRESET=compact SEEDS=4,7 STEPS=30")
-    assert [sweep >= {"budget.iterations=30", seed} for sweep, seed in zip(sweeps, ("seed=4", "seed=7"))]
+    for sweep, seed in zip(sweeps, ("seed=4", "seed=7"), strict=True):
+        assert sweep >= {"budget.iterations=30", seed}
 
 
 def test_changes_are_compared_with_the_reference():

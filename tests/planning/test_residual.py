@@ -1,13 +1,17 @@
 """What time and direction explain of errors."""
 
 import math
+from collections import namedtuple
+from types import SimpleNamespace
 
 import pytest
 import torch
 
-from forewarp.planning.residual import cells_of, explained
+from forewarp.planning.residual import cells_of, explained, residual
+from tests.support.tiny_scene import ball_data
 
 VIEWS, CELLS = 40, 30
+Drawn = namedtuple("Drawn", "rgb depth opacity")
 
 
 @pytest.fixture(scope="module")
@@ -41,3 +45,16 @@ def test_noise_is_explained_by_nothing(seen):
 def test_cells_are_a_twentieth_of_the_extent():
     places = torch.stack([torch.linspace(0, 2, 401), torch.zeros(401), torch.zeros(401)], -1).double()
     assert 20 <= int(cells_of(places).max()) + 1 <= 22
+
+
+@pytest.mark.parametrize(("opacity", "tells"), [(0.0, False), (1.0, True)])
+def test_a_fit_without_opaque_matter_tells_nothing(opacity, tells):
+    def render(view, background):
+        count = len(view)
+        return Drawn(torch.full((count, 3), 0.5), torch.full((count,), 2.0), torch.full((count,), opacity))
+
+    method = SimpleNamespace(device="cpu", at=lambda moment: SimpleNamespace(render=render))
+    found = residual(method, ball_data().targets("train"), 1.5)
+    assert (found is not None) is tells
+    if tells:
+        assert found.seconds == 1.5

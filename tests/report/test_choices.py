@@ -150,7 +150,7 @@ def test_the_page_of_effects_compares_with_the_best_and_says_why(tmp_path):
     (ball,), (hook,) = (rows_of(text.partition("## Why")[0], name) for name in ("ball", "hook"))
     assert ball[3:5] == ["32.00 ± 0.14", "31.00 ± 0.00"]
     assert ball[-3:] == ["+1.00 ± 0.14", "above, the preset", "12.5 ± 0.0"]
-    assert hook[-3:] == ["-1.00", "**below**, every effect", "12.5"]
+    assert hook[-3:] == ["-1.00", "one seed, every effect", "12.5"]
     assert ["hook", "view", "x", "view, 3 %"] in rows_of(text.partition("## Why")[2], "hook")
     assert len(table.read_text().splitlines()) == 9
 
@@ -161,7 +161,7 @@ def test_seeds_are_paired_and_what_is_missing_is_empty(tmp_path):
     write_choice(tmp_path, "all_effects", seed=1, psnr=30.5)
     write_choice(tmp_path, "auto", scene="hook")
     ball, hook = choices(read_runs(tmp_path)[0]).rows
-    assert (ball[-3].mean, ball[-2]) == (pytest.approx(0.05), "within noise (0.10), every effect")
+    assert (ball[-3].mean, ball[-2]) == (pytest.approx(0.05), "one seed, every effect")
     assert hook[-4:-1] == [None, None, ""]
 
 

@@ -103,7 +103,7 @@ def test_the_page_tells_what_the_run_is(tmp_path, monkeypatch):
     )
     page = write(folder, Media([shown()]))
     expected = ["ball", "forward, preset fast", "31.25 dB", "training 0:50", "1.00 GiB", "a cpu", "2,000,000"]
-    expected += ["forewarp-train data.scene=ball", "trial +4.0 dB", "in 1:05", "off view trial +0.1 dB"]
+    expected += ["forewarp-train data.scene=ball", "trial +4.0 dB", "for 1:05", "off view trial +0.1 dB"]
     expected += [
         "on extra",
         "22.0 dB",

@@ -141,6 +141,7 @@ def refuse_all(config: DictConfig) -> None:
             raise ValueError(f"{key}: expected {' or '.join(choices)}, but got {config[key]}")
     refuse_seeds(config)
     refuse_two_models(config)
+    refuse_preset(config)
     refuse_other_methods(config)
     refuse_numbers(config, "views", "sheets", "reduce")
     check_values(config)
@@ -185,6 +186,15 @@ def refuse_seeds(config: DictConfig) -> None:
                 "hydra.sweeper.params.seed: expected one seed, as this sweeper would search among several, "
                 f"but got {seeds}; add hydra.sweeper.params.seed=0"
             )
+
+
+def refuse_preset(config: DictConfig) -> None:
+    """Refuse the paper's method in small for other methods, which have no such numbers."""
+    if config.preset.get("name") == "compact" and config.model.name not in ("forward", "backward"):
+        raise ValueError(
+            "preset: expected demo, fast or faithful, as compact is of model=forward and model=backward, but "
+            f"got compact beside model={config.model.name}"
+        )
 
 
 def refuse_two_models(config: DictConfig) -> None:

@@ -7,7 +7,7 @@ forewarp-report makes tables, curves and pages of runs that are already there. O
   kind=ablation       what each part of the paper's method brings, and whether the paper's order holds
   kind=minutes        what each method reaches on each scene in so many minutes, by seed and view
   kind=methods        all methods under one clock: what each reaches, PSNR against seconds, views side by side
-  kind=effects        planned runs against every effect at once and the paper's fixed set
+  kind=effects        planned runs beside the preset, every effect and none
   kind=search         the trials of a search, the best first: what was chosen, score, steps, seconds
   kind=compare        a few runs side by side, printed, and with out=FOLDER drawn
   kind=run            the page of one run: its video, truth against prediction, curves, effects and why

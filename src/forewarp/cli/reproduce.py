@@ -71,7 +71,6 @@ OF_ABLATIONS = shlex.split(
     "callbacks.pictures=null logger=none paths.runs=runs/ablations"
 )
 ROOM = ["stage.coarse.background_num_voxels=[[0,27000]]", "stage.fine.background_num_voxels=[[0,110592]]"]
-SPECIMENS = ["still", "rigid", "band", "glossy", "room", "quick", "daylight", "blocks", "spin"]
 # With small=1, beside Job.small; gpu has a tiny model, too.
 SMALL = shlex.split("sheets=0 logger=none callbacks.pictures=null")
 TINY = shlex.split(
@@ -266,8 +265,9 @@ def ablations(keys: Keys) -> Job:
 
 def _at_rest(keys: Keys) -> Job:
     """Leave out each part where training has come to rest; a lane for each seed."""
-    if keys.minutes or keys.methods or keys.scenes:
-        raise ValueError("minutes, methods, scenes: expected none beside preset=compact, but got some")
+    unused = ("minutes", "methods", "scenes", "sweeps", "model", "changes")
+    if given := [name for name in unused if getattr(keys, name)]:
+        raise ValueError(f"{', '.join(given)}: expected none beside preset=compact, but got some")
     base = ["sweeps=ablation_at_rest", "score=null", "paths.runs=runs/ablations"]
     base += _until(steps=keys.steps or "1") if keys.steps or keys.small else []
     base += [f"paths.scenes={keys.data}"] if keys.data else []

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
@@ -26,6 +27,7 @@ from forewarp.training.stages import Run
 # Keys that do not change what a run computes.
 NOT_OF_IT = ("effects", "plan", "run", "evaluate", "sheets", "views", "reduce", "planned", "trust", "score")
 SHARE = 0.1  # of the run's budget that the short fit may take
+MOST = 1.0  # minutes of it, whatever the run's budget
 ENOUGH = 0.9  # of its steps that it must reach for its errors to count: stages end by the clock, too
 CAPTURES = ("cut_out", "video")  # options of the group ``capture`` that images can tell apart
 
@@ -79,17 +81,19 @@ def _decided(config: DictConfig, typed: list[str], folder: Path, run: Run, metho
     """Return the plan, without seconds: overrides, effects with reasons, evidence."""
     evidence, names = Evidence(survey(run.datamodule.scene)), [effect.name for effect in method.effects]
     chosen = {key_of(override): override.partition("=")[2] for override in typed}
+    of_user = {name for name in names if any(is_of(key, name) for key in chosen)}
     base = list(typed)
     if config.capture in CAPTURES and "capture" not in chosen:
         base.append(f"capture={CAPTURES[0] if evidence.cut_out else CAPTURES[1]}")
     budget = short(config.budget, method.still_steps)
     if evidence.silhouettes_rest and budget is not None:
-        still = [f"model/{name}=none" for name in names if f"model/{name}" not in chosen]
+        still = [f"model/{name}=none" for name in names if name not in of_user]
         evidence = replace(evidence, residual=_still_fit(merged(base, still), budget, folder / "still"))
     choices = compose("train", base, return_hydra_config=True).hydra.runtime.choices
     preset = {name: choices.get(f"model/{name}") or "none" for name in names}
-    of_user = {name: chosen[f"model/{name}"] for name in names if f"model/{name}" in chosen}
-    decisions = decide(method.effects, evidence, preset, of_user)
+    off = {name for name in names if chosen.get(f"model.{name}") in ("null", "None")}
+    as_typed = {name: "none" if name in off else preset[name] for name in of_user}
+    decisions = decide(method.effects, evidence, preset, as_typed)
     # The method and all choices: defaults may change.
     overrides = [f"model={choices['model']}", *base[len(typed) :]]
     overrides += [f"model/{d.effect}={d.choice}" for d in decisions if d.effect not in of_user]
@@ -99,6 +103,15 @@ def _decided(config: DictConfig, typed: list[str], folder: Path, run: Run, metho
         "effects": {d.effect: {"choice": d.choice, "on": d.on, "because": d.because} for d in decisions},
         "evidence": {name: value for name, value in asdict(evidence).items() if value is not None},
     }
+
+
+def is_of(key: str, effect: str) -> bool:
+    """Tell whether a typed key chooses an effect or sets its numbers.
+
+    >>> [is_of(key, "motion") for key in ("model/motion", "model.motion.tau", "model.rotation")]
+    [True, True, False]
+    """
+    return key in (f"model/{effect}", f"model.{effect}") or key.startswith(f"model.{effect}.")
 
 
 def _still_fit(overrides: list[str], budget: Mapping, folder: Path) -> Residual | None:
@@ -130,7 +143,7 @@ def short(budget: Mapping, steps: int) -> dict | None:
     minutes, iterations = budget["minutes"], budget["iterations"]
     if iterations is not None and SHARE * iterations < steps:
         return None
-    return {**budget, "minutes": None if minutes is None else SHARE * minutes, "iterations": steps}
+    return {**budget, "minutes": min(MOST, SHARE * (minutes or math.inf)), "iterations": steps}
 
 
 def refuse(config: DictConfig, typed: Sequence[str]) -> None:

@@ -16,6 +16,7 @@ from forewarp.scene.view import Target, View
 VIEWS = 40  # images whose errors are looked at
 _PIXELS = 12_000  # of each, of which
 _SOLID = 0.9  # at least so opaque ones count
+_FEWEST = 1000  # pixels in all, below which a fit shows nothing
 _CELL = 0.05  # side of a cell, of the extent of what is seen
 _FOLDS = 5  # of the images, each predicted from the others
 _RIDGE = 2.0  # as strong as two images without error
@@ -23,7 +24,7 @@ _COSINES = 2  # of a colour over time
 
 
 @torch.no_grad()
-def residual(method: Method, targets: Sequence[Target], seconds: float) -> Residual:
+def residual(method: Method, targets: Sequence[Target], seconds: float) -> Residual | None:
     """Measure the errors of a fitted method that stands still, in some of its training images.
 
     In each cell of space a colour linear in direction, cosines over time, and a constant colour are fitted to
@@ -33,6 +34,9 @@ def residual(method: Method, targets: Sequence[Target], seconds: float) -> Resid
         method: fitted without motion, and with colours that do not change.
         targets: training views.
         seconds: training time of the fit, which is passed on.
+
+    Returns:
+        None where hardly anything is opaque yet.
     """
     generator, samples = torch.Generator().manual_seed(0), []
     targets = [targets[i] for i in spread(len(targets), VIEWS)]
@@ -49,8 +53,8 @@ def residual(method: Method, targets: Sequence[Target], seconds: float) -> Resid
         of_image[:, 0] = number
         samples.append(torch.cat([places[solid], rays.directions[solid], error[solid], of_image], -1))
     places, directions, errors, views, times = torch.cat(samples).double().split([3, 3, 3, 1, 1], dim=-1)
-    if not len(places):
-        return Residual(0.0, 0.0, seconds)
+    if len(places) < _FEWEST:
+        return None
     cells = cells_of(places)
     over_time = torch.cos(math.pi * times * torch.arange(1, _COSINES + 1))
     by_time, by_direction = (explained(x, errors, cells, views[:, 0]) for x in (over_time, directions))

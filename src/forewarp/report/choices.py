@@ -295,6 +295,8 @@ def _verdict(change: Estimate | None, pairs: int) -> str:
     """Say whether a planned run is above, within or below noise."""
     if change is None:
         return "no pair"
+    if pairs == 1:
+        return "one seed"
     noise = max(LEAST, 2 * (change.deviation or 0.0) / math.sqrt(max(pairs, 1)))
     if abs(change.mean) <= noise:
         return f"within noise ({noise:.2f})"

@@ -27,7 +27,6 @@ _MOVED = 1e-3  # of the distance to the pivot: a camera that went farther has le
 _ARRIVAL = 0.5  # seconds in which a camera that was sent somewhere may still tell where it was
 _JPEG_QUALITY = {True: 92, False: 80}  # at rest and while moving
 _SPEEDS = ("0.1", "0.25", "0.5", "1", "2", "4")
-_NARROW = 600  # pixels of a page's width below which controls begin folded, as on a phone
 _MAX_CAMERAS = 200  # training cameras that are drawn
 _FOLLOW = "follow the point that I click"
 _ABOUT_SPLATS = "*splats*: drawn by the browser, with one colour from all sides and no trajectories"
@@ -46,7 +45,7 @@ class Page:
         self.viewer, self.client, self.folder = viewer, client, folder
         self.session = Session(viewer, self)
         self._splats, self._sent = None, float("-inf")
-        self._is_wide = self.canvas()[0] >= _NARROW
+        self._is_wide = self.canvas()[0] >= self.canvas()[1]  # else a phone's, of whatever pixels
         self._cameras: list[viser.CameraFrustumHandle] = []
         self._showing_cameras = threading.Lock()
         self.status = client.gui.add_markdown("...")
