@@ -96,7 +96,7 @@ def exact(viewer, tab, **changes):
     height, width = tab.picture().shape[:2]
     first = ViewState.first(viewer.scene)
     state = ViewState(**{"pose": first.pose, "fov": first.fov, "time": first.time} | changes)
-    image = viewer.image(state, round(width * ROWS / height), ROWS)[None].permute(0, 3, 1, 2)
+    image = viewer.image(state, *viewer.pages[-1].session.full_size())[None].permute(0, 3, 1, 2)
     resized = torch.nn.functional.interpolate(image, (height, width), mode="bilinear", antialias=True)
     return 255 * resized[0].permute(1, 2, 0).numpy()
 
