@@ -17,7 +17,7 @@ from torch import Tensor
 
 from forewarp.evaluation.evaluate import RenderedView, draw
 from forewarp.methods.method import HasMatter
-from forewarp.metrics.image import low_passed, psnr
+from forewarp.metrics.image import psnr
 from forewarp.ops.grid import dilate
 from forewarp.runs.build import build_run
 from forewarp.runs.config import saved_config
@@ -116,6 +116,32 @@ def error_shares(truth: Tensor, image: Tensor, foreground: Tensor) -> dict[str, 
     """Sum the squared error of an image (H, W, 3) in each region of its foreground (H, W)."""
     error = (truth - image).square().mean(-1)
     return {name: torch.where(mask, error, 0.0).sum() for name, mask in regions(foreground).items()}
+
+
+def low_passed(image: Tensor, pixels: float) -> Tensor:
+    """Fit an image that is linear between points ``pixels`` apart, like a slice of a trilinear grid.
+
+    Not a strict bound for a grid: grid points lie elsewhere in every view, and density makes edges.
+
+    Args:
+        image: (H, W, 3) in [0, 1].
+        pixels: distance of the points; at most 1 returns the image itself.
+
+    Returns:
+        (H, W, 3), the least-squares fit.
+    """
+    if pixels <= 1:
+        return image
+    rows, columns = (_projection(length, pixels) for length in image.shape[:2])
+    return torch.einsum("ab,bcd,ec->aed", rows, image.double(), columns).to(image.dtype)
+
+
+def _projection(length: int, pixels: float) -> Tensor:
+    """Return the projection (length, length) onto functions linear between the points, float64."""
+    places = (torch.arange(length).double() + 0.5) / pixels
+    points = torch.arange(math.ceil(length / pixels) + 1).double()
+    hats = (1 - (places[:, None] - points).abs()).clamp(min=0)
+    return hats @ torch.linalg.pinv(hats)
 
 
 def main(folders: list[str]) -> None:

@@ -77,7 +77,7 @@ def test_auto_fits_a_scene_that_stands_still_without_what_it_does_not_call_for(
     typed = ["model=particles", *TINY, "data.root=scenes", "data.scene=still", *short]
     ok("train", *typed, "effects=auto")
     made = yaml.safe_load((in_tmp / "still" / "plan.yaml").read_text())
-    assert made["evidence"]["residual"].keys() == {"by_time", "by_direction", "seconds"}
+    assert made["evidence"]["residual"].keys() == {"by_time", "by_direction"}
     assert not any(made["effects"][name]["on"] for name in ("motion", "rotation", "background"))
     assert yaml.safe_load((in_tmp / "still" / "config.yaml").read_text())["model"]["motion"] is None
     assert {path.name for path in in_tmp.glob("runs/still/plan-*/*")} == {"still", "plan.yaml"}

@@ -27,12 +27,10 @@ class Residual:
     Attributes:
         by_time, by_direction: shares of the squared error that colours changing over time, or with the
             direction of view, explain, beyond what a constant colour does. Negative: they fit noise.
-        seconds: training time of the fit.
     """
 
     by_time: float
     by_direction: float
-    seconds: float
 
 
 @dataclass(frozen=True)
@@ -62,7 +60,7 @@ class Evidence:
             return True, f"{why}; without silhouettes, motion is taken for granted"
         why += f"; a static shape explains all but {self.pictures.disagreement:.1%} of the silhouettes"
         if self.residual is None:
-            return True, why + (", but the budget is too small to tell" if self.silhouettes_rest else "")
+            return True, why + (", and no fit was long enough to tell more" if self.silhouettes_rest else "")
         share = self.residual.by_time
         return share > BY_TIME, f"{why}, and time {max(share, 0):.0%} of what a still fit leaves over"
 

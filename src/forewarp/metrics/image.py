@@ -194,29 +194,3 @@ def _window() -> list[float]:
     """Return the weights of a Gaussian window of 11 pixels."""
     weights = torch.exp(-(torch.arange(-_REACH, _REACH + 1, dtype=torch.float64) ** 2) / (2 * 1.5**2))
     return (weights / weights.sum()).tolist()
-
-
-def low_passed(image: Tensor, pixels: float) -> Tensor:
-    """Fit an image that is linear between points ``pixels`` apart, like a slice of a trilinear grid.
-
-    Not a strict bound for a grid: grid points lie elsewhere in every view, and density makes edges.
-
-    Args:
-        image: (H, W, 3) in [0, 1].
-        pixels: distance of the points; at most 1 returns the image itself.
-
-    Returns:
-        (H, W, 3), the least-squares fit.
-    """
-    if pixels <= 1:
-        return image
-    rows, columns = (_projection(length, pixels) for length in image.shape[:2])
-    return torch.einsum("ab,bcd,ec->aed", rows, image.double(), columns).to(image.dtype)
-
-
-def _projection(length: int, pixels: float) -> Tensor:
-    """Return the projection (length, length) onto functions linear between the points, float64."""
-    places = (torch.arange(length).double() + 0.5) / pixels
-    points = torch.arange(math.ceil(length / pixels) + 1).double()
-    hats = (1 - (places[:, None] - points).abs()).clamp(min=0)
-    return hats @ torch.linalg.pinv(hats)

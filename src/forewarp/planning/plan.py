@@ -85,14 +85,15 @@ def _decided(config: DictConfig, typed: list[str], folder: Path, run: Run, metho
     base = list(typed)
     if config.capture in CAPTURES and "capture" not in chosen:
         base.append(f"capture={CAPTURES[0] if evidence.cut_out else CAPTURES[1]}")
-    budget = short(config.budget, method.still_steps)
-    if evidence.silhouettes_rest and budget is not None:
-        still = [f"model/{name}=none" for name in names if name not in of_user]
-        evidence = replace(evidence, residual=_still_fit(merged(base, still), budget, folder / "still"))
     choices = compose("train", base, return_hydra_config=True).hydra.runtime.choices
     preset = {name: choices.get(f"model/{name}") or "none" for name in names}
     off = {name for name in names if chosen.get(f"model.{name}") in ("null", "None")}
     as_typed = {name: "none" if name in off else preset[name] for name in of_user}
+    budget = short(config.budget, method.still_steps)
+    is_still = all(choice == "none" for choice in as_typed.values())  # what was typed stays in the fit
+    if evidence.silhouettes_rest and budget is not None and is_still:
+        still = [f"model/{name}=none" for name in names if name not in of_user]
+        evidence = replace(evidence, residual=_still_fit(merged(base, still), budget, folder / "still"))
     decisions = decide(method.effects, evidence, preset, as_typed)
     # The method and all choices: defaults may change.
     overrides = [f"model={choices['model']}", *base[len(typed) :]]
@@ -129,8 +130,7 @@ def _still_fit(overrides: list[str], budget: Mapping, folder: Path) -> Residual 
         done = run.finished().values()
         if sum(stage["steps"] for stage in done) < ENOUGH * budget["iterations"]:
             return None
-        seconds = sum(stage["seconds"] for stage in done)
-        return residual(module.method, run.datamodule.targets("train"), round(seconds, 2))
+        return residual(module.method, run.datamodule.targets("train"))
 
 
 def short(budget: Mapping, steps: int) -> dict | None:

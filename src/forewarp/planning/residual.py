@@ -24,7 +24,7 @@ _COSINES = 2  # of a colour over time
 
 
 @torch.no_grad()
-def residual(method: Method, targets: Sequence[Target], seconds: float) -> Residual | None:
+def residual(method: Method, targets: Sequence[Target]) -> Residual | None:
     """Measure the errors of a fitted method that stands still, in some of its training images.
 
     In each cell of space a colour linear in direction, cosines over time, and a constant colour are fitted to
@@ -33,7 +33,6 @@ def residual(method: Method, targets: Sequence[Target], seconds: float) -> Resid
     Args:
         method: fitted without motion, and with colours that do not change.
         targets: training views.
-        seconds: training time of the fit, which is passed on.
 
     Returns:
         None where hardly anything is opaque yet.
@@ -58,7 +57,7 @@ def residual(method: Method, targets: Sequence[Target], seconds: float) -> Resid
     cells = cells_of(places)
     over_time = torch.cos(math.pi * times * torch.arange(1, _COSINES + 1))
     by_time, by_direction = (explained(x, errors, cells, views[:, 0]) for x in (over_time, directions))
-    return Residual(by_time, by_direction, seconds)
+    return Residual(by_time, by_direction)
 
 
 def cells_of(places: Tensor) -> Tensor:
