@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -11,6 +10,7 @@ from pathlib import Path
 from hydra import compose
 from omegaconf import DictConfig, open_dict
 
+from forewarp.clock import Clock
 from forewarp.data.checks import remarks
 from forewarp.methods.effect import Evidence, Residual, decide
 from forewarp.methods.method import Method
@@ -70,15 +70,20 @@ def make_plan(config: DictConfig, overrides: Sequence[str]) -> dict:
                 "use another plan.folder, or delete it"
             )
         return made | {"file": str(file), "found": True}
-    begin = time.perf_counter()
-    made = _decided(config, typed, folder, run, method)
-    made |= {"seconds": round(time.perf_counter() - begin, 1), "of": asked, "asked": list(overrides)}
+    clock = Clock(config.budget.clock)
+    with clock.running():
+        made, fitted = _decided(config, typed, folder, run, method, clock)
+    made |= {"seconds": round(clock.seconds + fitted, 1), "of": asked, "asked": list(overrides)}
     write_plan(file, made)
     return made | {"file": str(file)}
 
 
-def _decided(config: DictConfig, typed: list[str], folder: Path, run: Run, method: type[Method]) -> dict:
-    """Return the plan, without seconds: overrides, effects with reasons, evidence."""
+def _decided(
+    config: DictConfig, typed: list[str], folder: Path, run: Run, method: type[Method], clock: Clock
+) -> tuple[dict, float]:
+    """Return the plan, without seconds: overrides, effects with reasons, evidence; and the seconds of a short
+    fit, for which ``clock`` is paused, as a fit does not count reading and compiling.
+    """
     evidence, names = Evidence(survey(run.datamodule.scene)), [effect.name for effect in method.effects]
     chosen = {key_of(override): override.partition("=")[2] for override in typed}
     of_user = {name for name in names if any(is_of(key, name) for key in chosen)}
@@ -91,9 +96,11 @@ def _decided(config: DictConfig, typed: list[str], folder: Path, run: Run, metho
     as_typed = {name: "none" if name in off else preset[name] for name in of_user}
     budget = short(config.budget, method.still_steps)
     is_still = all(choice == "none" for choice in as_typed.values())  # what was typed stays in the fit
+    seconds = 0.0
     if evidence.silhouettes_rest and budget is not None and is_still:
         still = [f"model/{name}=none" for name in names if name not in of_user]
-        evidence = replace(evidence, residual=_still_fit(merged(base, still), budget, folder / "still"))
+        left, seconds = _still_fit(merged(base, still), budget, folder / "still", clock)
+        evidence = replace(evidence, residual=left)
     decisions = decide(method.effects, evidence, preset, as_typed)
     # The method and all choices: defaults may change.
     overrides = [f"model={choices['model']}", *base[len(typed) :]]
@@ -103,7 +110,7 @@ def _decided(config: DictConfig, typed: list[str], folder: Path, run: Run, metho
         "overrides": overrides,
         "effects": {d.effect: {"choice": d.choice, "on": d.on, "because": d.because} for d in decisions},
         "evidence": {name: value for name, value in asdict(evidence).items() if value is not None},
-    }
+    }, seconds
 
 
 def is_of(key: str, effect: str) -> bool:
@@ -115,9 +122,11 @@ def is_of(key: str, effect: str) -> bool:
     return key in (f"model/{effect}", f"model.{effect}") or key.startswith(f"model.{effect}.")
 
 
-def _still_fit(overrides: list[str], budget: Mapping, folder: Path) -> Residual | None:
-    """Fit the run without effects for a moment, and measure the errors that it leaves; None if the time was
-    too short to tell.
+def _still_fit(
+    overrides: list[str], budget: Mapping, folder: Path, clock: Clock
+) -> tuple[Residual | None, float]:
+    """Fit the run without effects for a moment, and measure the errors that it leaves, None if the time was
+    too short to tell; also return the seconds of the fit, for which ``clock`` is paused.
     """
     config = compose("train", without_switched_off(overrides))
     with open_dict(config):
@@ -126,11 +135,13 @@ def _still_fit(overrides: list[str], budget: Mapping, folder: Path) -> Residual 
     run = build_run(config)
     run.tell = lambda line: None
     with session(run, config):
-        module = run.fit().to(run.device)
+        with clock.paused():
+            module = run.fit().to(run.device)
         done = run.finished().values()
+        seconds = sum(stage["seconds"] for stage in done)
         if sum(stage["steps"] for stage in done) < ENOUGH * budget["iterations"]:
-            return None
-        return residual(module.method, run.datamodule.targets("train"))
+            return None, seconds
+        return residual(module.method, run.datamodule.targets("train")), seconds
 
 
 def short(budget: Mapping, steps: int) -> dict | None:
