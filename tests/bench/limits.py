@@ -1,13 +1,15 @@
 """``python -m tests.bench.limits RUN ...``: what limits the accuracy of fitted runs.
 
 Time, views, the size of voxels, or regions of the image: each run renders its test views and some training
-views, which are compared with the truth, and the truth with itself as blurred as the voxels.
+views, which are compared with the truth, and the truth with itself as blurred as the voxels. With ``--parts``
+(particles): what each part alone would reach, if it were fitted to a test view, too.
 """
 
 from __future__ import annotations
 
 import math
 import sys
+from dataclasses import replace
 from statistics import fmean
 
 import torch
@@ -15,6 +17,7 @@ from omegaconf import OmegaConf
 from tabulate import tabulate
 from torch import Tensor
 
+from forewarp.data.batches import Sampler
 from forewarp.evaluation.evaluate import RenderedView, draw
 from forewarp.methods.method import HasMatter
 from forewarp.metrics.image import psnr
@@ -23,6 +26,8 @@ from forewarp.runs.build import build_run
 from forewarp.runs.config import saved_config
 from forewarp.scene.frame import spread
 from forewarp.training.checkpoints import load_handover
+from forewarp.training.module import DynamicSceneModule
+from forewarp.training.objective import set_gradients
 from forewarp.training.stages import Run
 
 REGIONS = ("outside", "outline", "inside")
@@ -144,9 +149,73 @@ def _projection(length: int, pixels: float) -> Tensor:
     return hats @ torch.linalg.pinv(hats)
 
 
-def main(folders: list[str]) -> None:
+FITTED = {
+    "motion": ("nodes.translations", "nodes.rotations"),
+    "colours": ("colors", "sh", "color_over_time"),
+    "opacity": ("opacity", "opacity_over_time"),
+    "places and shapes": ("means", "scales", "quaternions"),
+}
+FITTED["all of these"] = tuple(name for names in FITTED.values() for name in names)
+RATE = 0.3  # of a stage's first learning rates
+
+
+def fitted_parts(run: Run, views: int = 4, steps: int = 60) -> dict[str, float | str]:
+    """Return the PSNR (dB, mean over images) of a finished run of particles on some test views, and with one
+    part alone fitted to each of these views: what is gained by much is what limits the run.
+
+    Where the capture says what moves, of these pixels alone.
+
+    Args:
+        run: a finished run of ``model=particles``.
+        views: number of test views.
+        steps: of each part, on each view.
+    """
+    module, scene = run.load(), run.datamodule.scene
+    method, found = module.method, {"scene": scene.name, "as it is": []} | {name: [] for name in FITTED}
+    parameters, targets = dict(method.named_parameters()), run.datamodule.targets("test")
+    kept = {name: value.detach().clone() for name, value in parameters.items()}
+    method.progress = 1.0  # no shift of times, and rigidity as at the end
+    for index in spread(len(targets), views):
+        target = targets[index]
+        pixels = None if target.moving is None else target.moving.flatten().nonzero()[:, 0]
+        found["as it is"].append(float(module.psnr_of(target, pixels)))
+        tested = replace(scene, train=scene.test)
+        behind = "white" if bool(target.background.all()) else "black"
+        sampler = Sampler(tested, background=behind, asks=method.asks, picker=lambda index=index: index)
+        batch = sampler.draw()
+        for part, names in FITTED.items():
+            optimizer = _optimizer(module, [name for name in names if name in parameters])
+            for _ in range(steps):
+                optimizer.zero_grad()
+                set_gradients(method, module.look(batch, module.objective.factors(0)).gradients)
+                optimizer.step()
+            found[part].append(float(module.psnr_of(target, pixels)))
+            with torch.no_grad():
+                for name, value in parameters.items():
+                    value.copy_(kept[name])
+                    value.grad = None
+    return {name: fmean(values) if isinstance(values, list) else values for name, values in found.items()}
+
+
+def _optimizer(module: DynamicSceneModule, names: list[str]) -> torch.optim.Adam:
+    """Make an Adam of some parameters, at a share of the stage's rates; those of lengths by the extent."""
+    method, rates = module.method, module.settings.lr
+    group_of = {id(p): group for group, own in method.param_groups().items() for p in own}
+    groups = []
+    for name in names:
+        parameter = method.get_parameter(name)
+        group = group_of[id(parameter)]
+        length = float(method.extent) if group in ("means", "node_translations") else 1.0
+        groups.append({"params": [parameter], "lr": RATE * float(rates[group]) * length})
+    return torch.optim.Adam(groups, eps=1e-15)
+
+
+def main(words: list[str]) -> None:
     """Print a row for each run."""
-    rows = [limits_of(build_run(saved_config(folder, OmegaConf.create(), "runs"))) for folder in folders]
+    folders, limits = [word for word in words if word != "--parts"], limits_of
+    if len(folders) < len(words):
+        limits = fitted_parts
+    rows = [limits(build_run(saved_config(folder, OmegaConf.create(), "runs"))) for folder in folders]
     print(tabulate(rows, "keys", tablefmt="github", floatfmt=".2f"))
 
 
