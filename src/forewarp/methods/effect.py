@@ -15,9 +15,9 @@ STILL = 0.001
 ENOUGH = 40  # images from which on it counts that nothing is seen to change
 NARROW = 15.0  # degrees between the most different cameras below which direction cannot be observed
 # Least shares of what a short still fit leaves over that time, and direction, explain. After ``still_steps``
-# time explains -0.07 to -0.03 of scenes that stand still and 0.13 to 0.24 where the light moves; direction
-# 0.06 to 0.1 of a matte scene and 0.22 to 0.32 of a glossy one.
-BY_TIME, BY_DIRECTION = 0.05, 0.15
+# time explains -0.10 to -0.04 of scenes that stand still and 0.03 to 0.20 where the light moves: anything at
+# all counts. Direction explains 0.05 to 0.11 of a matte scene and 0.16 to 0.29 of a glossy one.
+BY_TIME, BY_DIRECTION = 0.0, 0.15
 
 
 @dataclass(frozen=True)
