@@ -72,6 +72,8 @@ class Evidence:
         why = f"cameras differ by {spread:.0f} degrees"
         if self.residual is None:
             return True, why
+        if self.residual.by_time > BY_TIME:
+            return True, f"{why}, and changes over time hide what direction explains"
         share = self.residual.by_direction
         return share > BY_DIRECTION, f"{why}; it explains {max(share, 0):.0%} of what a still fit leaves over"
 
