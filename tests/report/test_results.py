@@ -86,6 +86,13 @@ def test_debug_runs_are_counted_and_left_out(tmp_path):
     assert (list(runs.by("variant")), left_out) == (["base"], ["left out: debug runs: 2"])
 
 
+def test_the_short_fit_of_a_plan_is_no_run(tmp_path):
+    still = write_run(tmp_path, "base")
+    (still.parent / "plan.yaml").write_text("effects: {}\n")
+    write_run(tmp_path / "beside", "base")
+    assert (len(read_runs(tmp_path)[0]), read_runs(tmp_path)[1]) == (1, [])
+
+
 def test_groups_hold_the_seeds_and_the_base_comes_first(tmp_path):
     for variant, seed, minutes in (("a", 1, 1.0), ("a", 0, 1.0), ("base", 0, 1.0), ("a", 0, 3.0)):
         write_run(tmp_path, variant, seed, minutes=minutes)

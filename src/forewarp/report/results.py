@@ -210,7 +210,8 @@ class Runs(list[Row]):
 
 
 def read_runs(root: Path, needed: Sequence[str] = ("metrics.json",)) -> tuple[Runs, list[str]]:
-    """Read all runs below a folder but those for debugging, which are too short to be compared.
+    """Read all runs below a folder but those for debugging, which are too short to be compared, and a plan's
+    short fits.
 
     Args:
         root: folder to search for ``config.yaml``.
@@ -225,6 +226,8 @@ def read_runs(root: Path, needed: Sequence[str] = ("metrics.json",)) -> tuple[Ru
     """
     runs, left_out, debugging = Runs(), [], 0
     for folder in sorted(path.parent for path in Path(root).rglob("config.yaml")):
+        if (folder.parent / "plan.yaml").is_file():
+            continue
         absent = [name for name in needed if not (folder / name).is_file()]
         try:
             row = read_run(folder)
