@@ -26,7 +26,6 @@ from forewarp.runs.build import build_run
 from forewarp.runs.config import saved_config
 from forewarp.scene.frame import spread
 from forewarp.training.checkpoints import load_handover
-from forewarp.training.module import DynamicSceneModule
 from forewarp.training.objective import set_gradients
 from forewarp.training.stages import Run
 
@@ -150,12 +149,13 @@ def _projection(length: int, pixels: float) -> Tensor:
 
 
 FITTED = {
-    "motion": ("nodes.translations", "nodes.rotations"),
+    "motion": ("node_translations", "node_rotations"),
     "colours": ("colors", "sh", "color_over_time"),
     "opacity": ("opacity", "opacity_over_time"),
     "places and shapes": ("means", "scales", "quaternions"),
 }
 FITTED["all of these"] = tuple(name for names in FITTED.values() for name in names)
+LENGTHS = ("means", "node_translations")  # their rates are shares of the scene's extent
 RATE = 0.3  # of a stage's first learning rates
 
 
@@ -171,43 +171,36 @@ def fitted_parts(run: Run, views: int = 4, steps: int = 60) -> dict[str, float |
         steps: of each part, on each view.
     """
     module, scene = run.load(), run.datamodule.scene
-    method, found = module.method, {"scene": scene.name, "as it is": []} | {name: [] for name in FITTED}
-    parameters, targets = dict(method.named_parameters()), run.datamodule.targets("test")
-    kept = {name: value.detach().clone() for name, value in parameters.items()}
+    method, targets = module.method, run.datamodule.targets("test")
+    found: dict[str, list[float]] = {}
+    kept = [value.detach().clone() for value in method.parameters()]
+    unit = {True: float(method.extent), False: 1.0}
     method.progress = 1.0  # no shift of times, and rigidity as at the end
     for index in spread(len(targets), views):
         target = targets[index]
         pixels = None if target.moving is None else target.moving.flatten().nonzero()[:, 0]
-        found["as it is"].append(float(module.psnr_of(target, pixels)))
-        tested = replace(scene, train=scene.test)
+        found.setdefault("as it is", []).append(float(module.psnr_of(target, pixels)))
         behind = "white" if bool(target.background.all()) else "black"
-        sampler = Sampler(tested, background=behind, asks=method.asks, picker=lambda index=index: index)
-        batch = sampler.draw()
+        tested = replace(scene, train=scene.test)
+        batch = Sampler(tested, background=behind, asks=method.asks, picker=lambda index=index: index).draw()
         for part, names in FITTED.items():
-            optimizer = _optimizer(module, [name for name in names if name in parameters])
+            groups = [
+                {"params": group["params"], "lr": RATE * group["base_lr"] * unit[group["name"] in LENGTHS]}
+                for group in module.configure_optimizers().param_groups
+                if group["name"] in names
+            ]
+            if not groups:
+                continue
+            optimizer = torch.optim.Adam(groups, eps=1e-15)
             for _ in range(steps):
-                optimizer.zero_grad()
                 set_gradients(method, module.look(batch, module.objective.factors(0)).gradients)
                 optimizer.step()
-            found[part].append(float(module.psnr_of(target, pixels)))
+            found.setdefault(part, []).append(float(module.psnr_of(target, pixels)))
             with torch.no_grad():
-                for name, value in parameters.items():
-                    value.copy_(kept[name])
+                for value, before in zip(method.parameters(), kept):
+                    value.copy_(before)
                     value.grad = None
-    return {name: fmean(values) if isinstance(values, list) else values for name, values in found.items()}
-
-
-def _optimizer(module: DynamicSceneModule, names: list[str]) -> torch.optim.Adam:
-    """Make an Adam of some parameters, at a share of the stage's rates; those of lengths by the extent."""
-    method, rates = module.method, module.settings.lr
-    group_of = {id(p): group for group, own in method.param_groups().items() for p in own}
-    groups = []
-    for name in names:
-        parameter = method.get_parameter(name)
-        group = group_of[id(parameter)]
-        length = float(method.extent) if group in ("means", "node_translations") else 1.0
-        groups.append({"params": [parameter], "lr": RATE * float(rates[group]) * length})
-    return torch.optim.Adam(groups, eps=1e-15)
+    return {"scene": scene.name} | {name: fmean(values) for name, values in found.items()}
 
 
 def main(words: list[str]) -> None:

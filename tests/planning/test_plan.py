@@ -1,5 +1,7 @@
 """From a scene to its plan, and from the plan to a run."""
 
+import json
+
 import pytest
 import yaml
 from omegaconf import OmegaConf
@@ -78,6 +80,10 @@ def test_auto_fits_a_scene_that_stands_still_without_what_it_does_not_call_for(
     ok("train", *typed, "effects=auto")
     made = yaml.safe_load((in_tmp / "still" / "plan.yaml").read_text())
     assert made["evidence"]["residual"].keys() == {"by_time", "by_direction"}
+    fitted = [
+        json.loads(path.read_text())["seconds"] for path in in_tmp.glob("runs/still/plan-*/still/*/done.json")
+    ]
+    assert made["seconds"] >= round(sum(fitted), 1) > 0
     assert not any(made["effects"][name]["on"] for name in ("motion", "rotation", "background"))
     assert yaml.safe_load((in_tmp / "still" / "config.yaml").read_text())["model"]["motion"] is None
     assert {path.name for path in in_tmp.glob("runs/still/plan-*/*")} == {"still", "plan.yaml"}

@@ -87,10 +87,10 @@ def test_debug_runs_are_counted_and_left_out(tmp_path):
 
 
 def test_the_short_fit_of_a_plan_is_no_run(tmp_path):
-    still = write_run(tmp_path, "base")
-    (still.parent / "plan.yaml").write_text("effects: {}\n")
-    write_run(tmp_path / "beside", "base")
-    assert (len(read_runs(tmp_path)[0]), read_runs(tmp_path)[1]) == (1, [])
+    beside = write_run(tmp_path, "base")
+    (beside.parent / "plan.yaml").write_text("effects: {}\n")
+    write_run(tmp_path, "auto").rename(beside.parent / "still")
+    assert ([row["folder"] for row in read_runs(tmp_path)[0]], read_runs(tmp_path)[1]) == ([beside], [])
 
 
 def test_groups_hold_the_seeds_and_the_base_comes_first(tmp_path):

@@ -226,7 +226,7 @@ def read_runs(root: Path, needed: Sequence[str] = ("metrics.json",)) -> tuple[Ru
     """
     runs, left_out, debugging = Runs(), [], 0
     for folder in sorted(path.parent for path in Path(root).rglob("config.yaml")):
-        if (folder.parent / "plan.yaml").is_file():
+        if folder.name == "still" and (folder.parent / "plan.yaml").is_file():
             continue
         absent = [name for name in needed if not (folder / name).is_file()]
         try:
