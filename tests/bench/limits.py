@@ -2,16 +2,21 @@
 
 Time, views, the size of voxels, or regions of the image: each run renders its test views and some training
 views, which are compared with the truth, and the truth with itself as blurred as the voxels. With ``--parts``
-(particles): what each part alone would reach, if it were fitted to a test view, too.
+(particles): what each part alone would reach, if it were fitted to a test view, too. With ``--between``
+(films of one camera): what motion that is smooth from image to image would reach.
 """
 
 from __future__ import annotations
 
 import math
 import sys
+from bisect import bisect
+from collections.abc import Callable
 from dataclasses import replace
 from statistics import fmean
 
+import cv2
+import numpy as np
 import torch
 from omegaconf import OmegaConf
 from tabulate import tabulate
@@ -25,6 +30,7 @@ from forewarp.ops.grid import dilate
 from forewarp.runs.build import build_run
 from forewarp.runs.config import saved_config
 from forewarp.scene.frame import spread
+from forewarp.scene.view import View
 from forewarp.training.checkpoints import load_handover
 from forewarp.training.objective import set_gradients
 from forewarp.training.stages import Run
@@ -157,6 +163,7 @@ FITTED = {
 FITTED["all of these"] = tuple(name for names in FITTED.values() for name in names)
 LENGTHS = ("means", "node_translations")  # their rates are shares of the scene's extent
 RATE = 0.3  # of a stage's first learning rates
+FOLLOWED = 1.5  # pixels by which flow there and back may differ
 
 
 def fitted_parts(run: Run, views: int = 4, steps: int = 60) -> dict[str, float | str]:
@@ -203,11 +210,77 @@ def fitted_parts(run: Run, views: int = 4, steps: int = 60) -> dict[str, float |
     return {"scene": scene.name} | {name: fmean(values) for name, values in found.items()}
 
 
+def smooth_between(run: Run) -> dict[str, float | str]:
+    """Return the PSNR (dB, mean over images) of what moves in a finished run's test views, and of the same
+    pixels of the true image, moved by what smooth motion misses there.
+
+    Flow from the true image to the two training images on each side tells where its points are then. A line
+    through the next two, and a cubic curve through all four, miss the truth by a field of pixels; what the
+    still pixels miss is the camera's shake, which poses explain, and is subtracted. *Followed* are pixels
+    whose flow leads back.
+
+    Args:
+        run: a finished run on images in the order of their times, with masks of what moves.
+
+    Raises:
+        ValueError: if no test image has masks, and two training images on each side.
+    """
+    module, search = run.load(), cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+    tests, train = run.datamodule.targets("test"), run.datamodule.targets("train")
+    times = [frame.time for frame in run.datamodule.scene.train]
+    found: dict[str, list[float]] = {}
+    for target in tests:
+        after = bisect(times, target.frame.time)
+        if target.moving is None or not 2 <= after <= len(times) - 2:
+            continue
+        here, missed = cv2.cvtColor(_bytes(target.rgb), cv2.COLOR_RGB2GRAY), {}
+        back_again = np.ones(here.shape, bool)
+        flows = []
+        for index in range(after - 2, after + 2):
+            there = cv2.cvtColor(_bytes(train[index].rgb), cv2.COLOR_RGB2GRAY)
+            flow, back = search.calc(here, there, None), search.calc(there, here, None)
+            back_again &= np.linalg.norm(flow + _moved(back, flow), axis=-1) < FOLLOWED
+            flows.append(flow)
+        missed["as a line"] = (flows[1] + flows[2]) / 2
+        missed["as a cubic curve"] = (4 * (flows[1] + flows[2]) - flows[0] - flows[3]) / 6
+        truth, moving = target.rgb.numpy(), target.moving.numpy()
+        with torch.no_grad():
+            shown = module.render(View(target.frame.camera), target.moment, target.background).rgb
+        images = {"as it is": shown.clamp(0, 1).reshape(truth.shape).numpy()}
+        for name, field in missed.items():
+            own = field - np.median(field[~moving & back_again], axis=0)
+            images[name] = _moved(truth, own)
+        for name, image in images.items():
+            for kind, pixels in (("", moving), (", followed", moving & back_again)):
+                value = psnr(torch.from_numpy(image[pixels][None]), torch.from_numpy(truth[pixels][None]))
+                found.setdefault(name + kind, []).append(value)
+    if not found:
+        raise ValueError(
+            f"{run.folder}: expected test images with masks between training images, but got none"
+        )
+    return {"scene": run.datamodule.scene.name} | {name: fmean(values) for name, values in found.items()}
+
+
+def _bytes(image: Tensor) -> np.ndarray:
+    """Return an image (H, W, 3) in [0, 1] as bytes."""
+    return (image.numpy() * 255).round().clip(0, 255).astype(np.uint8)
+
+
+def _moved(image: np.ndarray, flow: np.ndarray) -> np.ndarray:
+    """Return an image (H, W, C) at pixels moved by ``flow`` (H, W, 2)."""
+    y, x = np.mgrid[: flow.shape[0], : flow.shape[1]].astype(np.float32)
+    return cv2.remap(
+        image, x + flow[..., 0], y + flow[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+    )
+
+
+KINDS: dict[str, Callable] = {"--parts": fitted_parts, "--between": smooth_between}
+
+
 def main(words: list[str]) -> None:
     """Print a row for each run."""
-    folders, limits = [word for word in words if word != "--parts"], limits_of
-    if len(folders) < len(words):
-        limits = fitted_parts
+    folders = [word for word in words if word not in KINDS]
+    limits = next((KINDS[word] for word in words if word in KINDS), limits_of)
     rows = [limits(build_run(saved_config(folder, OmegaConf.create(), "runs"))) for folder in folders]
     print(tabulate(rows, "keys", tablefmt="github", floatfmt=".2f"))
 
