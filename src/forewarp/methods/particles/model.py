@@ -63,7 +63,7 @@ class Particles(Method):
         choices: see ``options.Effects``.
     """
 
-    terms = ("photo", *IMAGE_LOSSES, "depth", "rigid", "smooth")
+    terms = ("photo", *IMAGE_LOSSES, "depth", "rigid", "smooth", "static")
     numbers = tuple(key for key in Numbers.__dataclass_fields__ if key != "name")
     asks = Asks(kind="pictures", straight=True)
     effects, still_steps = EFFECTS, 700  # a step is of one image
@@ -286,7 +286,7 @@ class Particles(Method):
         if not has_depth:
             values["depth"] = lambda: None
         if self.nodes is None:
-            values["rigid"] = values["smooth"] = lambda: None
+            values |= dict.fromkeys(("rigid", "smooth", "static"), lambda: None)
         error = torch.tensor(squared / numbers, dtype=torch.float64)
         return Step(values, error, {"particles": len(self.means)}, gradients)
 
@@ -340,6 +340,9 @@ class Particles(Method):
                 motion, nodes.positions, compared.maps, nodes.edges, nodes.edge_weights, rigid
             )
             smooth, extent = factors.get("smooth", 0.0), float(self.extent)
+            if static := factors.get("static", 0.0):
+                to_rest, terms["static"] = nodes.pull_to_rest(motion, static, extent)
+                by_motion = by_motion + to_rest
             terms["smooth"], of_nodes = nodes.backward(time, motion_time, basis, by_motion, smooth, extent)
             gradients |= {"skinning.logits": compared.skin, **of_nodes}
         if self.shared is not None:

@@ -19,6 +19,8 @@ _HALF_STEP = 1e-3  # of all time: for central differences by time
 _FULL = 0.05  # share of a spline's basis at a time, from which on its knot counts as seen
 _FARTHEST = 0.2  # of all time: no image's time is off by more
 _BEYOND = _FARTHEST + 2 * _HALF_STEP  # of all time, by which a curve must reach beyond [0, 1]
+_REST = 3e-3  # of the scene's extent: motion below which nodes are no longer pulled to rest with full force
+_REST_TIMES = 16  # over which a node's mean place is taken
 _PULL = 0.1  # of the learning rate: by how much a step draws an offset towards 0
 
 
@@ -110,6 +112,7 @@ class Nodes(nn.Module):
         self.register_buffer("edges", neighbours.contiguous())
         self.register_buffer("edge_weights", stiffness / max(neighbours.numel(), 1))
         self.register_buffer("spacing", spacing.clamp(min=1e-6 * max(float(unit), _LEAST) ** 0.5))
+        self._mean_of, self._mean_basis = None, None  # see pull_to_rest
         self.register_buffer("stopped", torch.zeros(count, dtype=torch.bool) if rests else None)
         self.register_buffer("seen_times", torch.tensor([curve.canonical_time] * 2))  # from, to
 
@@ -259,6 +262,37 @@ class Nodes(nn.Module):
             gradients.append(self.time_offsets.gradients(time, by_time))
         names = ("nodes.translations", "nodes.rotations", "nodes.time_offsets.values")
         return bent, {name: value for name, value in zip(names, gradients) if value is not None}
+
+    @torch.no_grad()
+    def pull_to_rest(self, motion: Tensor, factor: float, unit: float) -> tuple[Tensor, float]:
+        """Pull nodes to where they are on average over the times seen, by a force that does not grow with
+        their distance: it holds what images say little about, and gives way where they say more.
+
+        Added to the loss is ``factor mean sqrt(d^2 + e^2)``, e = 0.003, d how far a node is from its mean
+        place, and apart from it how far its turning takes what is beside it, both over ``unit``.
+
+        Args:
+            motion: (M, 6) at a time, of ``motion_and_maps``.
+            factor: weight of the mean distance.
+            unit: a length, world units.
+
+        Returns:
+            gradients (M, 6) by ``motion``; and the mean of d over both.
+        """
+        span = self.seen_times.tolist()
+        if span != self._mean_of:  # they change as times come in
+            times = torch.linspace(*span, _REST_TIMES).tolist()
+            self._mean_of = span
+            self._mean_basis = self.summed_basis(*((time, 1 / _REST_TIMES) for time in times))
+        gradients, distance = torch.zeros_like(motion), 0.0
+        # A Gibbs vector is half the angle, and what rotates lies about ``spacing`` from the node.
+        arms = (1 / unit, 2 * self.spacing[:, None] / unit)
+        for value, arm, part in zip(self._coefficients(), arms, (slice(0, 3), slice(3, 6))):
+            away = arm * (motion[:, part] - torch.einsum("mkc,k->mc", value, self._mean_basis))
+            size = (away.square().sum(-1, keepdim=True) + _REST**2).sqrt()
+            gradients[:, part] = factor * arm * away / size / len(motion)
+            distance += float(size.mean()) - _REST
+        return gradients, distance
 
     def _second_difference(self, motion_time: float) -> Tensor:
         """Return the second difference (K,) of the basis around a time of the motion, within those seen."""
