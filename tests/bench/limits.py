@@ -15,7 +15,6 @@ from collections.abc import Callable
 from dataclasses import replace
 from statistics import fmean
 
-import cv2
 import numpy as np
 import torch
 from omegaconf import OmegaConf
@@ -215,17 +214,17 @@ def smooth_between(run: Run) -> dict[str, float | str]:
     pixels of the true image, moved by what smooth motion misses there.
 
     Flow from the true image to the two training images on each side tells where its points are then. A line
-    through the next two, and a cubic curve through all four, miss the truth by a field of pixels; what the
-    still pixels miss is the camera's shake, which poses explain, and is subtracted. *Followed* are pixels
-    whose flow leads back.
+    through the next two, and a cubic curve through all four, miss the truth by a field of pixels; its median
+    over the still pixels is the camera's shake, which poses explain, and is subtracted. *Followed* are pixels
+    whose flow leads back. The flow's own errors count as missed.
 
     Args:
         run: a finished run on images in the order of their times, with masks of what moves.
 
     Raises:
-        ValueError: if no test image has masks, and two training images on each side.
+        ValueError: if no test image has followed pixels of both kinds, and two training images on each side.
     """
-    module, search = run.load(), cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+    module = run.load()
     tests, train = run.datamodule.targets("test"), run.datamodule.targets("train")
     times = [frame.time for frame in run.datamodule.scene.train]
     found: dict[str, list[float]] = {}
@@ -233,25 +232,21 @@ def smooth_between(run: Run) -> dict[str, float | str]:
         after = bisect(times, target.frame.time)
         if target.moving is None or not 2 <= after <= len(times) - 2:
             continue
-        here, missed = cv2.cvtColor(_bytes(target.rgb), cv2.COLOR_RGB2GRAY), {}
-        back_again = np.ones(here.shape, bool)
-        flows = []
-        for index in range(after - 2, after + 2):
-            there = cv2.cvtColor(_bytes(train[index].rgb), cv2.COLOR_RGB2GRAY)
-            flow, back = search.calc(here, there, None), search.calc(there, here, None)
-            back_again &= np.linalg.norm(flow + _moved(back, flow), axis=-1) < FOLLOWED
-            flows.append(flow)
-        missed["as a line"] = (flows[1] + flows[2]) / 2
-        missed["as a cubic curve"] = (4 * (flows[1] + flows[2]) - flows[0] - flows[3]) / 6
+        beside = range(after - 2, after + 2)
+        flows, followed = _flows(target.rgb, [train[index].rgb for index in beside])
         truth, moving = target.rgb.numpy(), target.moving.numpy()
+        if not (moving & followed).any() or not (~moving & followed).any():
+            continue
         with torch.no_grad():
             shown = module.render(View(target.frame.camera), target.moment, target.background).rgb
         images = {"as it is": shown.clamp(0, 1).reshape(truth.shape).numpy()}
-        for name, field in missed.items():
-            own = field - np.median(field[~moving & back_again], axis=0)
-            images[name] = _moved(truth, own)
+        for name, used in (("as a line", slice(1, 3)), ("as a cubic curve", slice(4))):
+            at = [times[index] - target.frame.time for index in beside[used]]
+            field = np.einsum("f,fhwc->hwc", _shares(at), flows[used])
+            own = field - np.median(field[~moving & followed], axis=0)
+            images[name] = _moved(truth, -own)
         for name, image in images.items():
-            for kind, pixels in (("", moving), (", followed", moving & back_again)):
+            for kind, pixels in (("", moving), (", followed", moving & followed)):
                 value = psnr(torch.from_numpy(image[pixels][None]), torch.from_numpy(truth[pixels][None]))
                 found.setdefault(name + kind, []).append(value)
     if not found:
@@ -261,17 +256,35 @@ def smooth_between(run: Run) -> dict[str, float | str]:
     return {"scene": run.datamodule.scene.name} | {name: fmean(values) for name, values in found.items()}
 
 
-def _bytes(image: Tensor) -> np.ndarray:
-    """Return an image (H, W, 3) in [0, 1] as bytes."""
-    return (image.numpy() * 255).round().clip(0, 255).astype(np.uint8)
+def _shares(times: list[float]) -> np.ndarray:
+    """Return the shares, of values at some times, of the polynomial through them at time 0 (Lagrange)."""
+    return np.array([math.prod(b / (b - a) for b in times if b != a) for a in times])
+
+
+def _flows(image: Tensor, others: list[Tensor]) -> tuple[np.ndarray, np.ndarray]:
+    """Return where pixels (H, W) go in other images (F, H, W, 2), and which flow back leads back (H, W)."""
+    import cv2  # of the extra ``capture``
+
+    search, flows = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM), []
+    here, *there = (
+        cv2.cvtColor((view.numpy() * 255).round().clip(0, 255).astype(np.uint8), cv2.COLOR_RGB2GRAY)
+        for view in (image, *others)
+    )
+    followed = np.ones(here.shape, bool)
+    for other in there:
+        flow, back = search.calc(here, other, None), search.calc(other, here, None)
+        followed &= np.linalg.norm(flow + _moved(back, flow), axis=-1) < FOLLOWED
+        flows.append(flow)
+    return np.stack(flows), followed
 
 
 def _moved(image: np.ndarray, flow: np.ndarray) -> np.ndarray:
-    """Return an image (H, W, C) at pixels moved by ``flow`` (H, W, 2)."""
+    """Return an image (H, W, C) read at pixels moved by ``flow`` (H, W, 2)."""
+    import cv2
+
     y, x = np.mgrid[: flow.shape[0], : flow.shape[1]].astype(np.float32)
-    return cv2.remap(
-        image, x + flow[..., 0], y + flow[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
-    )
+    places = x + flow[..., 0].astype(np.float32), y + flow[..., 1].astype(np.float32)
+    return cv2.remap(image, *places, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
 
 
 KINDS: dict[str, Callable] = {"--parts": fitted_parts, "--between": smooth_between}

@@ -55,6 +55,7 @@ def film_of(places: list[float]) -> SimpleNamespace:
 
 
 def test_smooth_motion_reaches_what_is_smooth():
+    pytest.importorskip("cv2")
     moving, bending, jerking = ([-6, -3, 0, 3, 6], [5, 1.25, 0, 1.25, 5], [-6, -3, 2, 3, 6])
     line, cubic = "as a line, followed", "as a cubic curve, followed"
     even, bent, jerked = (smooth_between(film_of(places)) for places in (moving, bending, jerking))

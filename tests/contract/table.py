@@ -185,7 +185,7 @@ METHODS = {
             **{name: choice for effect in OF_PARTICLES.values() for name, choice in effect.on.items()},
         ),
         RATES,
-        {"photo": 1.0, "rigid": 3.0, "smooth": 0.1},
+        {"photo": 1.0, "rigid": 3.0, "smooth": 0.1, "static": 0.05},
         {"density_interval": 0.05, "density_until": 0.9}
         | {"lr_final_factor": dict.fromkeys(RATES, 0.1) | {"means": 0.01}},
         steps=150,

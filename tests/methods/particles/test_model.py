@@ -154,7 +154,7 @@ def test_an_effect_that_is_off_is_absent_and_the_others_are_there(effect):
     assert {name for name, on in switched(module.method).items() if not on} == gone
     if "motion" in gone:
         step = look(module, DATA)
-        assert step.terms["rigid"]() is step.terms["smooth"]() is None
+        assert all(step.terms[name]() is None for name in ("rigid", "smooth", "static"))
     if effect is None:
         names = {"means", "scales", "quaternions", "opacity", "colors"}
         assert set(dict(module.method.named_parameters())) == set(module.method.param_groups()) == names

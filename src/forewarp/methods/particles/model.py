@@ -340,8 +340,8 @@ class Particles(Method):
                 motion, nodes.positions, compared.maps, nodes.edges, nodes.edge_weights, rigid
             )
             smooth, extent = factors.get("smooth", 0.0), float(self.extent)
-            if static := factors.get("static", 0.0):
-                to_rest, terms["static"] = nodes.pull_to_rest(motion, static, extent)
+            if "static" in factors:
+                to_rest, terms["static"] = nodes.pull_to_rest(motion, factors["static"], extent)
                 by_motion = by_motion + to_rest
             terms["smooth"], of_nodes = nodes.backward(time, motion_time, basis, by_motion, smooth, extent)
             gradients |= {"skinning.logits": compared.skin, **of_nodes}

@@ -19,7 +19,7 @@ _HALF_STEP = 1e-3  # of all time: for central differences by time
 _FULL = 0.05  # share of a spline's basis at a time, from which on its knot counts as seen
 _FARTHEST = 0.2  # of all time: no image's time is off by more
 _BEYOND = _FARTHEST + 2 * _HALF_STEP  # of all time, by which a curve must reach beyond [0, 1]
-_REST = 3e-3  # of the scene's extent: motion below which nodes are no longer pulled to rest with full force
+_REST = 3e-3  # share of a unit below which nodes are pulled to rest with less than full force
 _REST_TIMES = 16  # over which a node's mean place is taken
 _PULL = 0.1  # of the learning rate: by how much a step draws an offset towards 0
 
@@ -112,7 +112,7 @@ class Nodes(nn.Module):
         self.register_buffer("edges", neighbours.contiguous())
         self.register_buffer("edge_weights", stiffness / max(neighbours.numel(), 1))
         self.register_buffer("spacing", spacing.clamp(min=1e-6 * max(float(unit), _LEAST) ** 0.5))
-        self._mean_of, self._mean_basis = None, None  # see pull_to_rest
+        self._averaged: tuple[list[float], Tensor] | None = None  # see _mean_basis
         self.register_buffer("stopped", torch.zeros(count, dtype=torch.bool) if rests else None)
         self.register_buffer("seen_times", torch.tensor([curve.canonical_time] * 2))  # from, to
 
@@ -184,11 +184,17 @@ class Nodes(nn.Module):
         """Return how far each node takes what is beside it (M,) from its mean place, world units."""
         bases = torch.stack([self.basis(time) for time in times])
         distance = torch.zeros_like(self.spacing)
-        # A Gibbs vector is half the angle, and what rotates lies about ``spacing`` from the node.
-        for value, arm in zip(self._coefficients(), (1.0, 2 * self.spacing)):
+        for value, arm in zip(self._coefficients(), self._arms()):
             went = torch.einsum("mkc,tk->tmc", value, bases)
             distance += arm * (went - went.mean(0)).norm(dim=-1).amax(0)
         return distance
+
+    def _arms(self) -> tuple[float, Tensor]:
+        """Return the factors by which translations, and rotations (M,), become distances.
+
+        A Gibbs vector is half the angle, and what rotates lies about ``spacing`` from the node.
+        """
+        return 1.0, 2 * self.spacing
 
     @torch.no_grad()
     def stop(self, which: Tensor, times: list[float]) -> None:
@@ -268,31 +274,34 @@ class Nodes(nn.Module):
         """Pull nodes to where they are on average over the times seen, by a force that does not grow with
         their distance: it holds what images say little about, and gives way where they say more.
 
-        Added to the loss is ``factor mean sqrt(d^2 + e^2)``, e = 0.003, d how far a node is from its mean
-        place, and apart from it how far its turning takes what is beside it, both over ``unit``.
+        Added to the loss is, once for translations and once for rotations, ``factor`` times the mean over
+        nodes of ``sqrt(d^2 + e^2) - e``: e = 0.003, d how far a node is from its mean place, or how far its
+        turning from the mean takes what is beside it, over ``unit``. The mean counts as constant.
 
         Args:
             motion: (M, 6) at a time, of ``motion_and_maps``.
-            factor: weight of the mean distance.
+            factor: weight.
             unit: a length, world units.
 
         Returns:
-            gradients (M, 6) by ``motion``; and the mean of d over both.
+            gradients (M, 6) by ``motion``; and the sum of both means.
         """
-        span = self.seen_times.tolist()
-        if span != self._mean_of:  # they change as times come in
-            times = torch.linspace(*span, _REST_TIMES).tolist()
-            self._mean_of = span
-            self._mean_basis = self.summed_basis(*((time, 1 / _REST_TIMES) for time in times))
-        gradients, distance = torch.zeros_like(motion), 0.0
-        # A Gibbs vector is half the angle, and what rotates lies about ``spacing`` from the node.
-        arms = (1 / unit, 2 * self.spacing[:, None] / unit)
-        for value, arm, part in zip(self._coefficients(), arms, (slice(0, 3), slice(3, 6))):
-            away = arm * (motion[:, part] - torch.einsum("mkc,k->mc", value, self._mean_basis))
+        gradients, value, mean = torch.zeros_like(motion), 0.0, self._mean_basis().to(motion)
+        for coefficients, arm, part in zip(self._coefficients(), self._arms(), (slice(3), slice(3, 6))):
+            by_unit = torch.as_tensor(arm, device=motion.device).reshape(-1, 1) / unit
+            away = by_unit * (motion[:, part] - torch.einsum("mkc,k->mc", coefficients, mean))
             size = (away.square().sum(-1, keepdim=True) + _REST**2).sqrt()
-            gradients[:, part] = factor * arm * away / size / len(motion)
-            distance += float(size.mean()) - _REST
-        return gradients, distance
+            gradients[:, part] = factor * by_unit * away / size / len(motion)
+            value += float(size.mean()) - _REST
+        return gradients, value
+
+    def _mean_basis(self) -> Tensor:
+        """Return the curve's basis (K,), averaged over the times of the motion that were seen."""
+        span = [0.0, 1.0] if self.curve.reach() is None else self.seen_times.tolist()
+        if self._averaged is None or self._averaged[0] != span:  # they grow as times come in
+            times = torch.linspace(*span, _REST_TIMES).tolist()
+            self._averaged = span, self.summed_basis(*((time, 1 / _REST_TIMES) for time in times))
+        return self._averaged[1]
 
     def _second_difference(self, motion_time: float) -> Tensor:
         """Return the second difference (K,) of the basis around a time of the motion, within those seen."""
