@@ -430,3 +430,16 @@ def steps_of(
             f"{key}: expected {form} with ascending fractions and counts >= {least:g}, but got {given}"
         )
     return pairs
+
+
+def value_at(steps: Sequence[Sequence[float]], fraction: float) -> float | None:
+    """Return the value of a schedule, see ``steps_of``, at a fraction of a stage; None if it is empty.
+
+    >>> value_at([[0, 4], [0.25, 2]], 0.3)
+    2
+    """
+    value = None
+    for begin, number in steps:
+        if fraction >= begin or value is None:
+            value = number
+    return value

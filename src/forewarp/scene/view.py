@@ -14,6 +14,8 @@ from forewarp.scene.brief import brief
 from forewarp.scene.camera import Camera, Rays, joined
 from forewarp.scene.frame import Frame
 
+_WHOLLY = 0.999  # share of a pixel from which on all of it is valid
+
 
 @dataclass(frozen=True)
 class Moment:
@@ -144,6 +146,37 @@ class Observation:
         names = ("rgb", "background", "valid", "sensed")
         known = {name: getattr(self, name) for name in names if getattr(self, name) is not None}
         return replace(self, **{name: tensor.to(device) for name, tensor in known.items()})
+
+    def smaller(self, times: float) -> Observation:
+        """Average a whole image of ``straight`` pixels to one about so many times smaller: colours by their
+        alpha; a pixel is valid if all of it is; its depth is that of its middle. Where no pixel would be
+        valid, the image stays as it is.
+        """
+        camera = self.view.camera
+        whole, small = ((c.height, c.width) for c in (camera, camera.resized(*_divided(camera, times))))
+
+        def averaged(planes: Tensor) -> Tensor:
+            mean = torch.nn.functional.interpolate(planes.reshape(1, -1, *whole), small, mode="area")
+            return mean.reshape(len(planes), -1)
+
+        rgba = self.rgb.T.float()
+        color, alpha = averaged(rgba[:3] * rgba[3:]), averaged(rgba[3:])
+        rgba = torch.cat([color / alpha.clamp(min=1e-6), alpha]).round().to(torch.uint8).T.contiguous()
+        valid, sensed = self.valid, self.sensed
+        if valid is not None:
+            valid = averaged(valid[None].float())[0] > _WHOLLY
+            if not bool(valid.any()):
+                return self
+        if sensed is not None:
+            planes = sensed.reshape(1, -1, *whole)
+            sensed = torch.nn.functional.interpolate(planes, small, mode="nearest-exact").reshape(2, -1)
+        view = View(camera.resized(small[1], small[0]))
+        return replace(self, view=view, rgb=rgba, valid=valid, sensed=sensed)
+
+
+def _divided(camera: Camera, times: float) -> tuple[int, int]:
+    """Return the width and height of an image that is so many times smaller."""
+    return max(1, round(camera.width / times)), max(1, round(camera.height / times))
 
 
 @dataclass(frozen=True)

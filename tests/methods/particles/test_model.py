@@ -47,25 +47,31 @@ def test_gradients_are_those_of_autograd(options):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("factors", [{"photo": 1.0}, {"photo": 1.0, "dssim": 0.2}])
-def test_pixels_that_do_not_count_change_nothing(factors):
+@pytest.mark.parametrize(
+    ("factors", "scale"), [({"photo": 1.0}, 1), ({"photo": 1.0}, 2), ({"photo": 1.0, "dssim": 0.2}, 1)]
+)
+def test_pixels_that_do_not_count_change_nothing(factors, scale, monkeypatch):
+    monkeypatch.setattr(model, "SMALLEST", 10)
     DATA.asks = Particles.asks
     batch = next(iter(DATA.train_dataloader()))
     seen, steps = batch.observations[0], []
     valid = torch.zeros(seen.view.shape, dtype=torch.bool)
     valid[: len(valid) // 2] = True
-    module = module_with(DATA, numbers={"jitter": 0.0})
+    module = module_with(DATA, numbers={"jitter": 0.0, "image_scale": [[0, scale]]})
     shaken(module).method.nodes.seen_times.copy_(torch.tensor([0.0, 1.0]))
     for add in (0, 99):
         rgb = seen.rgb + (~valid.flatten())[:, None].byte() * add
         masked = replace(batch, observations=(replace(seen, rgb=rgb, valid=valid.flatten()),))
+        module.method.small.clear()  # else the second image would be the first
         steps.append(module.method.look(masked, factors, module.generator))
     for name, gradient in steps[0].gradients.items():
         if "dssim" not in factors:  # a window of it may reach beyond the edge
             assert torch.equal(gradient, steps[1].gradients[name]), name
     assert steps[0].squared_error == steps[1].squared_error or "dssim" in factors
+    seen = replace(seen, valid=valid.flatten())
+    seen = seen if scale == 1 else seen.smaller(scale)
     drawn = module.method.at(seen.moment).render(View(seen.view.camera), seen.background)
-    error = (drawn.rgb - composited(seen.rgb, seen.background))[valid.flatten()].square().mean()
+    error = (drawn.rgb - composited(seen.rgb, seen.background))[seen.valid].square().mean()
     assert float(steps[0].squared_error) == pytest.approx(float(error.detach()), rel=1e-3)
 
 
@@ -87,6 +93,34 @@ def test_image_losses_are_weighted_with_the_photo_term():
     for name, gradient in steps[2].gradients.items():
         expected = 2.0 * steps[0].gradients[name] + 0.5 * steps[1].gradients[name]
         assert float((gradient - expected).norm()) <= 1e-4 * float(expected.norm()) + 1e-12, name
+
+
+def test_images_are_smaller_at_first(monkeypatch):
+    """A step compares with an image that is made once; its terms are a share of all of it, as before."""
+    monkeypatch.setattr(model, "SMALLEST", 5)
+    scales = {"image_scale": [[0, 4], [0.5, 2], [0.75, 1]], "jitter": 0.0}
+    module, made, sizes = module_with(DATA, numbers=scales), [], {}
+    smaller = model.Observation.smaller
+    monkeypatch.setattr(model.Observation, "smaller", lambda seen, by: made.append(by) or smaller(seen, by))
+    compared = model.compare
+    monkeypatch.setattr(
+        model,
+        "compare",
+        lambda *args, **keys: sizes.setdefault(of[0], len(args[5])) and compared(*args, **keys),
+    )
+    losses = []
+    for progress in (0.0, 0.4, 0.5, 0.9):
+        of = [progress]
+        module.method.progress = progress
+        losses.append(float(look(module, DATA, 3, {"photo": 1.0}).terms["photo"]()))
+    assert sizes == {0.0: 25, 0.4: 25, 0.5: 100, 0.9: 400}
+    assert made == [4, 2]
+    assert losses[0] == losses[1]
+    assert losses[0] == pytest.approx(losses[-1], rel=0.5)
+    monkeypatch.setattr(model, "SMALLEST", 10)
+    module.method.progress, of[0] = 0.0, "no smaller than that"
+    look(module, DATA, 2, {"photo": 1.0})
+    assert sizes[of[0]] == 100
 
 
 def with_depth(data, shown=slice(None)):

@@ -15,6 +15,7 @@ def test_defaults_are_those_of_the_command():
     config = OmegaConf.to_container(composed("model=particles", "preset=fast"), resolve=True)
     stage = config["stage"]["fine"]
     stage["effects"] = tuple(stage["effects"])
+    stage["image_scale"] = tuple(map(tuple, stage["image_scale"]))
     assert Numbers(**{name: stage[name] for name in Particles.numbers}) == Numbers()
     assert Effects(**{name: config["model"][name] for name in NAMES}) == Effects()
     assert set(config["model"]) == {"name", "_target_", "_partial_", *NAMES}
@@ -64,6 +65,11 @@ def test_numbers_follow_the_images():
         ),
         (Numbers, {"jitter": "some"}, "stage.fine.jitter: expected a number >= 0, but got 'some'"),
         (Numbers, {"shell": 0.5}, "stage.fine.shell: expected 0 or a number >= 1, but got 0.5"),
+        (
+            Numbers,
+            {"image_scale": [[0.5, 2]]},
+            r"stage.fine.image_scale: expected \[\[0, count\], .*, but got \[\[0.5, 2\]\]",
+        ),
         (Numbers, {"natural_splines": 1}, "stage.fine.natural_splines: expected true or false, but got 1"),
     ],
 )

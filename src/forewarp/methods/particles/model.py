@@ -13,10 +13,10 @@ from torch import Tensor, nn
 from forewarp.fields.curves import Curve
 from forewarp.fields.moving import GaussiansSnapshot, cosines, pinhole_of
 from forewarp.losses import IMAGE_LOSSES, robust
-from forewarp.methods.method import Method, Snapshot, Start, Step
+from forewarp.methods.method import Method, Snapshot, Start, Step, value_at
 from forewarp.methods.particles import density, queries
 from forewarp.methods.particles.nodes import Nodes, Skinning, TimeOffsets, are_rows
-from forewarp.methods.particles.options import EFFECTS, Effects, Numbers, view_share
+from forewarp.methods.particles.options import EFFECTS, SMALLEST, Effects, Numbers, view_share
 from forewarp.methods.particles.shared import begin_window, check_still, left_alone
 from forewarp.methods.particles.start import (
     compile_kernels,
@@ -39,6 +39,7 @@ from forewarp.scene.cloud import Cloud
 from forewarp.scene.view import Asks, Batch, Moment, Observation
 
 _FEWEST_TIMES = 8  # of training, for learned corrections of them
+_KEPT = 2**28  # bytes of colours of smaller images that are kept
 # Parameters and buffers with a row for each particle; those of effects that are off are None.
 _ROWS = ("means", "scales", "quaternions", "opacity", "colors", "sh", "color_over_time", "opacity_over_time")
 _ROWS += ("gradient_sum", "image_count", "unseen_rounds", "resting", "shared")
@@ -100,6 +101,7 @@ class Particles(Method):
         self.ends = min(times), max(times)
         self.progress = self.decay = self.hidden_decay = 0.0
         self.shown_now: list[Tensor] = []  # which particles each image of this step showed
+        self.small_by, self.small = 1.0, {}  # images made so many times smaller, by frame
 
         self.box = start.scene.box if self.stage.shell and not start.scene.has_alpha else None
         values = self._first_values(start)
@@ -273,8 +275,10 @@ class Particles(Method):
         """See ``Method``. Images are rendered one after the other, each as a whole."""
         terms, gradients = dict.fromkeys(self.terms, 0.0), {}
         squared, numbers, views, has_depth = 0.0, 0, len(batch.observations), False
-        for seen in batch.observations:
-            squared_error, of_image, found = self._compare(seen, factors, generator, views)
+        for whole in batch.observations:
+            seen = self._smaller(whole)
+            covered = float(self.covered_pixels) * len(seen.view) / len(whole.view)
+            squared_error, of_image, found = self._compare(seen, factors, generator, views, covered)
             count = len(seen.view) if seen.valid is None else int(seen.valid.sum())
             squared, numbers = squared + squared_error, numbers + 3 * count
             for name, value in of_image.items():
@@ -290,10 +294,29 @@ class Particles(Method):
         error = torch.tensor(squared / numbers, dtype=torch.float64)
         return Step(values, error, {"particles": len(self.means)}, gradients)
 
+    def _smaller(self, seen: Observation) -> Observation:
+        """Return an image as small as ``image_scale`` has it now; the first ones are kept, as many as fit."""
+        asked, camera = value_at(self.stage.image_scale, self.progress), seen.view.camera
+        times = min(asked, max(camera.width, camera.height) / SMALLEST)
+        if asked != self.small_by:
+            self.small_by, self.small = asked, {}
+        if times <= 1:
+            return seen
+        frame = seen.moment.frame
+        small = self.small.get(frame) or seen.smaller(times)
+        if frame is not None and (len(self.small) + 1) * small.rgb.numel() <= _KEPT:
+            self.small[frame] = small
+        return replace(small, background=seen.background)
+
     def _compare(
-        self, seen: Observation, factors: Mapping[str, float], generator: torch.Generator, views: int
+        self,
+        seen: Observation,
+        factors: Mapping[str, float],
+        generator: torch.Generator,
+        views: int,
+        covered: float,
     ) -> tuple[float, dict[str, float], dict[str, Tensor]]:
-        """Compare with one of a step's images.
+        """Compare with one of a step's images, of which ``covered`` pixels show anything.
 
         Returns:
             the sum of squared errors; the terms; and the step's gradients, by parameter.
@@ -308,7 +331,7 @@ class Particles(Method):
             motion, maps = nodes.motion_and_maps(basis)
             warp = Warp(maps, self.skinning.links, self.skinning.weights())
         colors, terms = self._color_parameters(), {}
-        loss, covered = self._image_loss(factors, terms), float(self.covered_pixels)
+        loss = self._image_loss(factors, terms)
         of_colors = factors.get("photo", 0.0) if loss is None else 1.0
         sensed = seen.sensed if "depth" in factors else None
         compared = compare(

@@ -8,8 +8,10 @@ from dataclasses import dataclass, fields, replace
 
 from forewarp.fields.curves import KINDS
 from forewarp.methods.effect import Effect, Evidence
+from forewarp.methods.method import steps_of
 from forewarp.ops.backend import is_number
 
+SMALLEST = 96  # pixels of an image's longer side, below which none is made smaller
 _VIEWS = 100  # training images from which on more of them call for no more particles
 
 
@@ -98,6 +100,8 @@ class Numbers:
         crowd_decay: extra opacity decay per step, scaled by ``max(0, 1 - covered_pixels / final_count)``.
         hidden_decay: as ``opacity_decay``, of the particles that the image does not show.
         rigid_final_factor: factor that the weight of ``rigid`` falls to by the end.
+        image_scale: ``[[fraction, times], ...]``: from a fraction on, images are so many times smaller, not
+            below 96 pixels of the longer side: motion over many pixels is found in cheap steps.
         shell: far planes of the cameras at which particles stand behind all that images show; what is outside
             the box is at rest; at least 1. 0: particles begin in the box, and all may move. Images with alpha
             have none.
@@ -126,6 +130,7 @@ class Numbers:
     crowd_decay: float = 2.5e-3
     hidden_decay: float = 0.0
     rigid_final_factor: float = 0.17
+    image_scale: Sequence[Sequence[float]] = ((0.0, 1),)
     shell: float = 0.0
     name: str = "fine"
 
@@ -135,6 +140,7 @@ class Numbers:
             raise ValueError(
                 f"{where}.effects: expected some of {', '.join(NAMES)}, but got {list(self.effects)}"
             )
+        steps_of(f"{where}.image_scale", self.image_scale, from_start=True)
         if not isinstance(self.natural_splines, bool):
             raise ValueError(
                 f"{where}.natural_splines: expected true or false, but got {self.natural_splines!r}"

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from forewarp.fields.grids import EMPTY, VoxelGrid
 from forewarp.methods.effect import Effect, Evidence
-from forewarp.methods.method import FRACTION, Start, check_number, steps_of
+from forewarp.methods.method import FRACTION, Start, check_number, steps_of, value_at
 from forewarp.methods.rows import renew_parameters
 from forewarp.ops.grid import dilate, trilinear
 from forewarp.scene.box import Box, Lattice
@@ -104,11 +104,7 @@ class VoxelStage:
 
     def at(self, key: str, fraction: float) -> float | None:
         """Return the value of the schedule ``key`` at a fraction; None if it is empty."""
-        value = None
-        for begin, number in getattr(self, key):
-            if fraction >= begin or value is None:
-                value = number
-        return value
+        return value_at(getattr(self, key), fraction)
 
 
 def first_voxels(start: Start, stage: VoxelStage, lattice: Lattice) -> Tensor:
