@@ -7,25 +7,25 @@ import torch
 pytest.importorskip("cv2")
 
 from forewarp.capture.frames import frames_for, speed  # noqa: E402
-from forewarp.capture.motion import moving_masks  # noqa: E402
+from forewarp.capture.motion import moving_masks, resting_masks  # noqa: E402
 from forewarp.data.images import write_image  # noqa: E402
 from forewarp.scene.camera import Camera  # noqa: E402
 
 WIDTH, HEIGHT, FOCAL, COUNT = 160, 120, 160.0, 9
 
 
-def film(folder, patch_speed):
+def film(folder, patch_speed, count=COUNT, rests_until=0):
     """Write a film of a wall at distance 1, before which a camera goes 3 pixels a frame to the right; a patch
-    of the wall goes down. Return paths, cameras and the patch's true masks.
+    of the wall goes down, from a frame on. Return paths, cameras and the patch's true masks.
     """
     draw = np.random.default_rng(0)
     texture = [
         draw.integers(0, 255, (60, 90, 3)).astype(np.uint8).repeat(4, 0).repeat(4, 1) for _ in range(2)
     ]
     paths, cameras, truth = [], [], []
-    for i in range(COUNT):
+    for i in range(count):
         image = texture[0][40 : 40 + HEIGHT, 3 * i : 3 * i + WIDTH].copy()
-        top, left = 20 + round(patch_speed * i), 60 - 3 * i + 24
+        top, left = 20 + round(patch_speed * max(0, i - rests_until)), 60 - 3 * i + 24
         mask = np.zeros((HEIGHT, WIDTH), bool)
         mask[top : top + 40, left : left + 50] = True
         image[mask] = texture[1][:40, :50].reshape(-1, 3)
@@ -56,6 +56,14 @@ def test_a_film_in_which_only_the_camera_moves_has_no_movers(tmp_path):
     assert not any(mask.any() for mask in moving_masks(paths, cameras))
 
 
+def test_what_moves_at_any_time_does_not_rest(tmp_path):
+    paths, cameras, truth = film(tmp_path, 2.0, count=18, rests_until=10)
+    assert (next(moving_masks(paths, cameras)) & truth[0]).sum() < 0.1 * truth[0].sum()  # not yet
+    (rests,) = resting_masks(paths, cameras, [2])
+    assert (rests & truth[2]).sum() < 0.2 * truth[2].sum()
+    assert (rests & ~truth[2]).sum() > 0.9 * (~truth[2]).sum()
+
+
 @pytest.mark.parametrize("step", [0.0, 3.0])
 def test_what_is_far_away_and_what_a_resting_camera_sees_rest(tmp_path, step):
     """The upper half is so far away that it does not shift; poses are off by noise."""
@@ -75,6 +83,7 @@ def test_of_images_that_cannot_be_followed_nothing_is_told(tmp_path):
     for path in paths:
         write_image(path, draw.integers(0, 255, (HEIGHT, WIDTH, 3)).astype(np.uint8))
     assert list(moving_masks(paths, [pinhole()] * 6)) == [None] * 6
+    assert resting_masks(paths, [pinhole()] * 6, [3]) == [None]
 
 
 def test_fast_films_give_more_frames():

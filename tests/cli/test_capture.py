@@ -282,6 +282,8 @@ def test_a_video_becomes_a_scene_that_is_trained_also_when_interrupted(ok, in_tm
     _, degrees, away = pose_errors([frame.camera for frame in frames], [cameras[row] for row in rows])
     assert degrees.max() < 1.0
     assert away.max() < 0.03
+    rests = [frame.load_resting for frame in frames if frame.load_resting is not None]
+    assert [float(mask().float().mean()) > 0.5 for mask in rests] == [True, True]
     words = ["data.root=captures", "data.scene=hand", "data.scale=1", "trainer=cpu", "logger=none", "run=run"]
     budget = ["budget.minutes=null", "budget.iterations=40", "threads=1"]
     ok("train", "experiment=video_with_poses", *words, *budget)

@@ -359,13 +359,23 @@ def test_what_moves_is_written_and_read_at_every_scale(tmp_path, made):
     smaller = read_scene(tmp_path, "toy", scale=2)  # from the same files
     assert torch.equal(smaller.train[0].load_moving(), shares >= 0.5)
     shots = [
-        PosedShot(f"a_{i}.jpg", f.camera, f.load()[..., :3], f.time, moving=f.load_moving().numpy())
+        PosedShot(
+            f"a_{i}.jpg",
+            f.camera,
+            f.load()[..., :3],
+            f.time,
+            moving=f.load_moving().numpy(),
+            resting=moving if i == 4 else None,
+        )  # fmt: skip
         for i, f in enumerate(data.scene.train)
     ]
     write_scene(tmp_path / "again", shots, near=0.1, far=9.0, seconds=4.5, moving_from="a friend")
     again = read_scene(tmp_path, "again")
     assert again.protocol["moving"] == "a friend"
     assert torch.equal(again.test[0].load_moving(), torch.from_numpy(moving))
+    rests = [f.load_resting() for f in (*again.train, *again.test) if f.load_resting is not None]
+    assert len(rests) == 1  # a mask of what rests need not be in all frames
+    assert torch.equal(rests[0], torch.from_numpy(moving))
 
 
 def test_masks_of_what_moves_are_of_all_frames_and_of_the_images_size(tmp_path, made):

@@ -25,7 +25,8 @@ _REACH = 5  # images before and after that a pixel is followed through
 _AGREE, _SLOPPY = 0.5, 0.05  # pixels, and share of the flow, by which there and back may differ
 _LEAST = 4  # images of a pixel's way from which on it is known
 _TELLS = 0.3  # share of an image's pixels that must be known; of photos far apart hardly one is
-_OFF = 2.0  # pixels by which a point at rest may miss its way
+_OFF, _CREPT = 2.0, 3.0  # pixels by which a point at rest may miss its way: of a few images, of a whole film
+_LOOKS = 40  # images of a whole film in which a way is looked at
 # Of 255: least change of what moves before a fixed camera, and how many deviations of a pixel's noise it is.
 _CHANGE, _NOISE = 14.0, 5.0
 _SPECK, _GAP = 3, 5  # of the grid: smaller spots, and smaller holes, are noise
@@ -45,36 +46,70 @@ def moving_masks(paths: Sequence[Path], cameras: Sequence[Camera]) -> Iterator[n
 
     Cost: for an image of 480 x 360 about 40 ms of flow and 50 ms of geometry on one core, 200 with a lens.
     """
-    scale = min(1.0, _SIDE / max(cameras[0].width, cameras[0].height))
-    size = [max(_LEAST_SIDE, round(scale * length)) for length in (cameras[0].width, cameras[0].height)]
-    small = [camera.resized(*size) for camera in cameras]
-    search = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
-
-    @lru_cache(maxsize=2 * _REACH + 2)
-    def grey(i: int) -> np.ndarray:
-        image = read_image(paths[i]).numpy()[..., :3]
-        return cv2.cvtColor(cv2.resize(image, size, interpolation=cv2.INTER_AREA), cv2.COLOR_RGB2GRAY)
-
-    @lru_cache(maxsize=4 * _REACH + 4)
-    def flow(i: int, j: int) -> np.ndarray:
-        return search.calc(grey(i), grey(j), None)
-
-    y, x = np.mgrid[_STEP // 2 : size[1] : _STEP, _STEP // 2 : size[0] : _STEP].astype(np.float32)
+    film = _Film(paths, cameras)
     for i in range(len(paths)):
-        tracks = {i: (x, y, np.ones(x.shape, bool))}
+        tracks = film.tracks(i, range(i - _REACH, i + _REACH + 1))
+        yield film.where(_OFF, tracks)
+
+
+def resting_masks(
+    paths: Sequence[Path], cameras: Sequence[Camera], which: Sequence[int]
+) -> list[np.ndarray | None]:
+    """Tell which pixels of some images rest in the whole film, bool (h, w), as far as they can be followed;
+    else see ``moving_masks``. A way of seconds is not exact to a pixel: what creeps may count as resting.
+
+    Cost: for each of them the flow of all images that a pixel is followed to, 25 ms an image.
+    """
+    film, every, masks = _Film(paths, cameras), max(1, len(paths) // _LOOKS), []
+    for i in which:
+        tracks = film.tracks(i, range(len(paths)))
+        looked = {j: tracks[j] for j in tracks if abs(j - i) <= _REACH or (j - i) % every == 0}
+        moves = film.where(_CREPT, looked)
+        masks.append(None if moves is None else ~moves)
+    return masks
+
+
+class _Film:
+    """A film's images, made small, and the flow between neighbours."""
+
+    def __init__(self, paths: Sequence[Path], cameras: Sequence[Camera]) -> None:
+        scale = min(1.0, _SIDE / max(cameras[0].width, cameras[0].height))
+        sides = cameras[0].width, cameras[0].height
+        self.paths, self.size = paths, [max(_LEAST_SIDE, round(scale * length)) for length in sides]
+        self.cameras = [camera.resized(*self.size) for camera in cameras]
+        self.search = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+        self.grey = lru_cache(maxsize=2 * _REACH + 2)(self._grey)
+        self.flow = lru_cache(maxsize=4 * _REACH + 4)(self._flow)
+
+    def _grey(self, i: int) -> np.ndarray:
+        image = read_image(self.paths[i]).numpy()[..., :3]
+        return cv2.cvtColor(cv2.resize(image, self.size, interpolation=cv2.INTER_AREA), cv2.COLOR_RGB2GRAY)
+
+    def _flow(self, i: int, j: int) -> np.ndarray:
+        return self.search.calc(self.grey(i), self.grey(j), None)
+
+    def tracks(self, i: int, among: range) -> dict[int, tuple]:
+        """Follow a grid of pixels of an image to those ``among`` that there are: see ``_followed``."""
+        y, x = np.mgrid[_STEP // 2 : self.size[1] : _STEP, _STEP // 2 : self.size[0] : _STEP]
+        first = x.astype(np.float32), y.astype(np.float32), np.ones(x.shape, bool)
+        tracks = {i: first}
         for direction in (1, -1):
-            track = tracks[i]
-            for j in range(i, i + direction * _REACH, direction):
-                if not 0 <= j + direction < len(paths):
-                    break
-                track = _followed(track, flow(j, j + direction), flow(j + direction, j))
-                tracks[j + direction] = track
-        error, is_known = _errors(tracks, small)
+            track, j = first, i + direction
+            while j in among and 0 <= j < len(self.paths) and track[2].any():
+                before = j - direction
+                track = tracks[j] = _followed(track, self.flow(before, j), self.flow(j, before))
+                j += direction
+        return tracks
+
+    def where(self, off: float, tracks: dict) -> np.ndarray | None:
+        """Tell which pixels (h, w) are more than ``off`` pixels away from where they would be at rest; None
+        where too few are known.
+        """
+        error, is_known = _errors(tracks, self.cameras)
         if is_known.mean() < _TELLS:
-            yield None
-        else:
-            moves = _whole(error > _OFF, is_known).astype(np.float32)
-            yield cv2.resize(moves, size, interpolation=cv2.INTER_LINEAR) > 0.5
+            return None
+        moves = _whole(error > off, is_known).astype(np.float32)
+        return cv2.resize(moves, self.size, interpolation=cv2.INTER_LINEAR) > 0.5
 
 
 @dataclass(frozen=True)

@@ -13,13 +13,14 @@ import torch
 from torch import Tensor
 
 from forewarp.capture.frames import Frames, Progress, Source, shrunk
-from forewarp.capture.motion import moving_masks
+from forewarp.capture.motion import moving_masks, resting_masks
 from forewarp.capture.poses import Reconstruction
 from forewarp.data.images import common_header, read_image, write_image
 from forewarp.data.posed_video import SCALES, PosedShot, write_scene
 from forewarp.drawing.images import draw_discs, sample_lines
 from forewarp.scene.box import Box
 from forewarp.scene.camera import Camera, mean_up
+from forewarp.scene.frame import middle_of
 
 # Points beyond these quantiles are taken for outliers, unless they lie close to the rest.
 _QUANTILES, _SLACK, _MARGIN = (0.02, 0.98), 0.25, 0.05
@@ -29,6 +30,7 @@ _ROLL = 0.01  # mean square of the sine by which a hand rolls a camera, and some
 _LEVEL = 1e-3  # sine of the angle between up and ahead below which all cameras look up or down
 _MIDWAY = 0.5  # share of its points' median distance from which on a camera's view belongs to the box
 _MIN_SIDE = 96  # pixels: smaller copies are of no use
+_RESTING = 2  # images around the middle that say what rests in the whole film; one may be held out
 MASK = "masks/burnt_in.png"  # in the scene's folder: dark where something is burnt in
 _DRAWING, _BORDER = 640, 0.06  # pixels of each drawing; share of it that stays free at its ends
 _FIRST, _LAST, _BOX = (0.10, 0.25, 0.75), (0.85, 0.20, 0.15), (0.55, 0.55, 0.55)  # colours of cameras, box
@@ -149,11 +151,14 @@ def write(
     has_alpha = common_header([frames.folder / name for name in names], one_size=False).has_alpha
     scales = [s for s in SCALES[1:] if shortest // s >= _MIN_SIDE]
     cameras, times = [found.cameras[name] for name in names], {frames.times[name] for name in names}
+    is_film = (
+        not frames.cameras and len(times) == len(names) and len({(c.width, c.height) for c in cameras}) == 1
+    )
     masks, moving_from, share = [None] * len(names), None, 0.0
     if frames.masks is not None:
         moving_from = frames.masks_from
         masks = (read_image(frames.masks / f"{name}.png")[..., 0].numpy() == 0 for name in names)
-    elif not frames.cameras and len(times) == len(names) and len({(c.width, c.height) for c in cameras}) == 1:
+    elif is_film:
         found_masks = []
         for mask in moving_masks([frames.folder / name for name in names], cameras):
             found_masks.append(mask)
@@ -162,12 +167,18 @@ def write(
             moving_from = "optical flow against the cameras"
             nothing = np.zeros(next(mask.shape for mask in found_masks if mask is not None), bool)
             masks = [nothing if mask is None else mask for mask in found_masks]
+    resting = {}
+    if moving_from is not None and is_film:
+        middle = middle_of(frames.times[name] for name in names)
+        near = sorted(range(len(names)), key=lambda i: abs(frames.times[names[i]] - middle))[:_RESTING]
+        found_masks = resting_masks([frames.folder / name for name in names], cameras, near)
+        resting = {names[i]: mask for i, mask in zip(near, found_masks) if mask is not None}
 
     def shots() -> Iterator[PosedShot]:
         nonlocal share
         for done, (name, moving) in enumerate(zip(names, masks), 1):
+            size = cameras[done - 1].width, cameras[done - 1].height
             if moving is not None:
-                size = cameras[done - 1].width, cameras[done - 1].height
                 moving = cv2.resize(moving.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
                 if burnt is not None:  # it moves against the world, but is none of it
                     moving = moving & ~burnt
@@ -180,7 +191,10 @@ def write(
                 write_image(folder / f"images_{scale}" / name, small)
             time = (frames.times[name] - first) / (last - first) if last > first else 0.0
             rig = {"taken_by": frames.cameras.get(name), "moment": frames.moments.get(name)}
-            yield PosedShot(name, found.cameras[name], pixels, time, moving=moving, **rig)
+            rests = resting.get(name)
+            if rests is not None:
+                rests = cv2.resize(rests.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
+            yield PosedShot(name, found.cameras[name], pixels, time, moving=moving, resting=rests, **rig)
             progress(len(names) + done, 2 * len(names))
 
     options = {"near": limits.near, "far": limits.far, "aabb": limits.box} if limits else {}

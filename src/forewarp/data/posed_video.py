@@ -9,8 +9,8 @@ holds points that never move.
 Beyond nerfstudio's keys a frame may have ``camera``, a name or a number of which of several cameras took it;
 ``moment``, the number from 0 of the instant that it belongs to, where cameras film at times of their own;
 ``moving_path``, a grey PNG as large as the unscaled image, bright where something moves, which is scored
-apart; ``depth_file_path`` is nerfstudio's. ``moving_from`` says where masks of motion come from, ``seconds``
-how long the film is.
+apart; ``resting_path``, in some frames, bright where something rests in the whole film; ``depth_file_path``
+is nerfstudio's. ``moving_from`` says where masks of motion come from, ``seconds`` how long the film is.
 """
 
 from __future__ import annotations
@@ -90,9 +90,10 @@ _OF_CAMERA = ("w", "h", "fl_x", "fl_y", "cx", "cy", "camera_model", "k1", "k2", 
 class PosedShot:
     """An image to write: ``name`` its file, .png or .jpg; ``pixels`` uint8 (H, W, 3), or (H, W, 4) of
     straight alpha; ``camera`` of that size, its near and far are not written; ``time`` in [0, 1] or None;
-    ``split`` train, val or test, or "" where the reader is to choose; ``moving`` bool (H, W), what moves, or
-    None where it is not known; ``taken_by`` the name of the camera, of a rig, and ``moment`` the number of
-    the instant, from 0; ``depth`` (H', W') along the optical axis and its ``confidence``, as measured.
+    ``split`` train, val or test, or "" where the reader is to choose; ``moving`` bool (H, W), what moves, and
+    ``resting``, what rests in the whole film, None where it is not known; ``taken_by`` the name of the
+    camera, of a rig, and ``moment`` the number of the instant, from 0; ``depth`` (H', W') along the optical
+    axis and its ``confidence``, as measured.
     """
 
     name: str
@@ -101,6 +102,7 @@ class PosedShot:
     time: float | None = None
     split: str = ""
     moving: np.ndarray | None = None
+    resting: np.ndarray | None = None
     taken_by: str | None = None
     moment: int | None = None
     depth: np.ndarray | None = None
@@ -243,8 +245,8 @@ def read_scene(
 
     def frame(e: ImageEntry) -> Frame:
         camera_id, camera = None if e.taken_by is None else views.index(e.taken_by), space.camera(e.camera)
-        optional = {"load_valid": e.valid, "load_moving": e.moving, "camera_id": camera_id}
-        return Frame(e.name, e.time, camera, e.load, **optional, moment=e.moment)
+        masks = {"load_valid": e.valid, "load_moving": e.moving, "load_resting": e.resting}
+        return Frame(e.name, e.time, camera, e.load, **masks, camera_id=camera_id, moment=e.moment)
 
     train, val, test = (tuple(map(frame, parts[split])) for split in SPLITS)
     train = tuple(replace(f, load_sensed=sensed(f.name, f.camera)) for f in train)
@@ -315,6 +317,7 @@ class ImageEntry:
     has_alpha: bool
     valid: StoredMask | None = None
     moving: MovingMask | None = None
+    resting: MovingMask | None = None
     taken_by: str | None = None
     moment: int | None = None
     depth: Path | None = None
@@ -345,17 +348,14 @@ def _read_entries(
     absent = {_name_of(file.parent, f.own.get("file_path"), f.where("file_path")) for f in frames}
     entries, has_mask, turned = [], [], []
     for entry, image in there:
-        mask, moving, header = None, None, inspect_image(image)
+        mask, header = None, inspect_image(image)
         turned += [image] if header.is_turned else []
         if "mask_path" in entry.own and masks != "off":
             mask = _file(entry, "mask_path", scale)
             inspect_image(mask, header.size, f" as {image.name}")
-        if "moving_path" in entry.own:
-            moving = MovingMask(_file(entry, "moving_path", 1), header.size)
-            size = inspect_image(moving.path).size
-            if any(abs(n - big / scale) >= 1 for n, big in zip(header.size, size)):
-                expected = f"{by(scale * n for n in header.size)} pixels as {image.name}"
-                raise mismatch(moving.path, expected, by(size))
+        moving, resting = (
+            _motion(entry, key, image, header.size, scale) for key in ("moving_path", "resting_path")
+        )
         camera = camera_of(entry, header.size, scale, image, pose=pose_in(entry, axes, inverse))
         name = _name_of(file.parent, entry.own.get("file_path"), entry.where("file_path"))
         valid = None
@@ -375,7 +375,7 @@ def _read_entries(
         moment = entry.own.get("moment")
         moment = None if moment is None else whole(moment, entry.where("moment"), 0)
         depth = entry.path("depth_file_path") if "depth_file_path" in entry.own else None
-        beside = valid, moving, taken_by, moment, depth
+        beside = valid, moving, resting, taken_by, moment, depth
         entries.append(ImageEntry(name, time_in(entry), camera, load, is_cut_out, *beside))
     for key, given in (
         ("mask_path", has_mask),
@@ -407,6 +407,22 @@ def _file(entry, key: str, scale: int) -> Path:
     if scale > 1:
         path = path.parent.with_name(f"{path.parent.name}_{scale}") / path.name
     return with_suffix(path)
+
+
+def _motion(entry, key: str, image: Path, size: tuple[int, int], scale: int) -> MovingMask | None:
+    """Find the mask of which pixels of an image, ``size`` large, move or rest; None without such a key.
+
+    Raises:
+        SceneError: for a mask that is not as large as the image that is not ``scale`` times smaller.
+    """
+    if key not in entry.own:
+        return None
+    mask = MovingMask(_file(entry, key, 1), size)
+    found = inspect_image(mask.path).size
+    if any(abs(n - big / scale) >= 1 for n, big in zip(size, found)):
+        expected = f"{by(scale * n for n in size)} pixels as {image.name}"
+        raise mismatch(mask.path, expected, by(found))
+    return mask
 
 
 def _name_of(folder: Path, value: object, where: str) -> str:
@@ -562,8 +578,9 @@ def _write_shot(folder: Path, shot: PosedShot, taken: set[str]) -> dict:
         trust = np.asarray(shot.confidence)
         trust = trust / LEVELS if trust.dtype.kind in "iu" else trust
         write_array(folder / f"confidence/{shot.name.removesuffix(suffix)}.npy", trust)
-    if shot.moving is not None:
-        mask = np.uint8(255) * np.asarray(shot.moving, bool)
-        entry["moving_path"] = f"moving/{shot.name.removesuffix(suffix)}.png"
-        write_image(folder / entry["moving_path"], check_pixels(shot.name, mask, shapes[0][:2]))
+    for kind, mask in (("moving", shot.moving), ("resting", shot.resting)):
+        if mask is not None:
+            mask = np.uint8(255) * np.asarray(mask, bool)
+            entry[f"{kind}_path"] = f"{kind}/{shot.name.removesuffix(suffix)}.png"
+            write_image(folder / entry[f"{kind}_path"], check_pixels(shot.name, mask, shapes[0][:2]))
     return entry

@@ -27,7 +27,8 @@ class Frame:
     the instants, where cameras film together but at times of their own.
     ``load_valid()``, if not None, gives (H, W) bool: the pixels, at least one, that count in training and in
     metrics.
-    ``load_moving()``, if not None, gives (H, W) bool: the pixels of what moves, which are scored apart.
+    ``load_moving()``, if not None, gives (H, W) bool: the pixels of what moves, which are scored apart;
+    ``load_resting()`` those of what rests in the whole film.
     ``load_sensed()``, if not None, gives (2, H, W) float32: ray depth as a sensor measured it, world units, 0
     where it did not, and its confidence in [0, 1]: evidence to train on, not the truth.
     ``load_covisible()``, if not None, gives (H, W) bool: the pixels of what training images show too.
@@ -43,6 +44,7 @@ class Frame:
     camera_id: int | None = None
     load_valid: Callable[[], Tensor] | None = None
     load_moving: Callable[[], Tensor] | None = None
+    load_resting: Callable[[], Tensor] | None = None
     load_sensed: Callable[[], Tensor] | None = None
     load_covisible: Callable[[], Tensor] | None = None
     keypoints: Tensor | None = None

@@ -7,10 +7,12 @@ import pytest
 import torch
 
 from forewarp.data.module import SceneDataModule
+from forewarp.methods.effect import switched
 from forewarp.methods.particles import density
 from forewarp.methods.particles.density import _product, _quaternions, come_to_rest, renew, too_near
 from forewarp.methods.rows import take_rows
 from forewarp.ops.gaussians import moved, rotations
+from forewarp.scene.frame import sightings
 from tests.support.particles import BARE, EVERY, look, module_with, small_data
 
 DATA = small_data()
@@ -210,6 +212,29 @@ def test_what_is_beyond_the_box_rests_without_a_node_and_may_be_large():
         method.advance(0.1 * number, number, optimizer)
     assert bool(method.resting[method.beyond(method.means.data)].all())
     assert int(method.resting.sum()) > int(beyond.sum())  # split, not removed
+    assert int(method.skinning.shares[method.resting].count_nonzero()) == 0
+
+
+@pytest.mark.parametrize("share", [0.9, 0.5])
+def test_what_masks_say_rests_in_a_film_follows_no_node(share):
+    """Masks of rest count where most of an image rests; what moves in the images at hand does not."""
+    height, width = DATA.scene.train[0].camera.height, DATA.scene.train[0].camera.width
+    moves, rests = torch.zeros(2, height, width, dtype=torch.bool)
+    moves[: height // 2], rests[-round(share * height) :] = True, True
+    masks = {"load_moving": lambda: moves, "load_resting": lambda: rests}
+    scene = replace(DATA.scene, train=tuple(replace(frame, **masks) for frame in DATA.scene.train))
+    data = SceneDataModule(lambda: scene, rays=1)
+    data.setup("fit")
+    assert module_with(data).method.resting is None
+    method = module_with(data, numbers={"rest_by_masks": True}).method
+    assert not switched(method)["background"]
+    cameras = [frame.camera for frame in scene.train]
+    moving, _ = sightings(method.means.data, cameras, [moves] * len(cameras))
+    at_rest, seen = sightings(method.means.data, cameras, [~moves & rests] * len(cameras))
+    assert 0 < int((at_rest == seen).sum()) < len(seen)
+    assert bool(method.resting[at_rest == seen].all()) == (share == 0.9)
+    assert not bool(method.resting[moving == seen].any())
+    assert bool(method.resting.any()) == (share == 0.9)
     assert int(method.skinning.shares[method.resting].count_nonzero()) == 0
 
 

@@ -19,6 +19,7 @@ from forewarp.methods.particles.nodes import Nodes, Skinning, TimeOffsets, are_r
 from forewarp.methods.particles.options import EFFECTS, SMALLEST, Effects, Numbers, view_share
 from forewarp.methods.particles.shared import begin_window, check_still, left_alone
 from forewarp.methods.particles.start import (
+    at_rest,
     compile_kernels,
     covered_pixels,
     first_points,
@@ -122,8 +123,12 @@ class Particles(Method):
         self.register_buffer("unseen_rounds", torch.zeros(count))  # infinite: to be removed
         self.register_buffer("round", torch.zeros((), dtype=torch.int64))
         self.least_motion = effects.background
-        may_rest = effects.background is not None or (self.box is not None and effects.motion is not None)
-        self.register_buffer("resting", self.beyond(self.means.data) if may_rest else None)
+        rests_at_once = self.box is not None or self.stage.rest_by_masks
+        may_rest = effects.background is not None or (rests_at_once and effects.motion is not None)
+        resting = self.beyond(self.means.data) if may_rest else None
+        if may_rest and self.stage.rest_by_masks and not start.blank:
+            resting |= at_rest(start.scene, self.means.data)
+        self.register_buffer("resting", resting)
         # Rows of the run that windows of a film begin from: particles that stay as they are; -1: of its own.
         self.register_buffer("shared", values.get("shared"))
 

@@ -102,6 +102,8 @@ class Numbers:
         rigid_final_factor: factor that the weight of ``rigid`` falls to by the end.
         image_scale: ``[[fraction, times], ...]``: from a fraction on, images are so many times smaller, not
             below 96 pixels of the longer side: motion over many pixels is found in cheap steps.
+        rest_by_masks: whether particles follow no node that rest in the whole film by masks of its images, if
+            it has any and most of an image rests.
         shell: far planes of the cameras at which particles stand behind all that images show; what is outside
             the box is at rest; at least 1. 0: particles begin in the box, and all may move. Images with alpha
             have none.
@@ -131,6 +133,7 @@ class Numbers:
     hidden_decay: float = 0.0
     rigid_final_factor: float = 0.17
     image_scale: Sequence[Sequence[float]] = ((0.0, 1),)
+    rest_by_masks: bool = False
     shell: float = 0.0
     name: str = "fine"
 
@@ -141,10 +144,9 @@ class Numbers:
                 f"{where}.effects: expected some of {', '.join(NAMES)}, but got {list(self.effects)}"
             )
         steps_of(f"{where}.image_scale", self.image_scale, from_start=True)
-        if not isinstance(self.natural_splines, bool):
-            raise ValueError(
-                f"{where}.natural_splines: expected true or false, but got {self.natural_splines!r}"
-            )
+        for key in ("natural_splines", "rest_by_masks"):
+            if not isinstance(getattr(self, key), bool):
+                raise ValueError(f"{where}.{key}: expected true or false, but got {getattr(self, key)!r}")
         shares = "initial_share", "final_share", "density_interval", "rigid_final_factor"
         for keys, expected, valid in (
             (shares, "a number in (0, 1]", lambda value: 0 < value <= 1),
@@ -202,7 +204,7 @@ class Numbers:
 EFFECTS = (
     Effect("motion", attribute="nodes", of=Evidence.of_time),
     Effect("rotation", attribute="nodes.rotations", needs="motion"),
-    Effect("background", attribute="resting", needs="motion"),
+    Effect("background", attribute="nodes.stopped", needs="motion"),
     Effect("opacity_over_time", of=Evidence.of_time),
     Effect("color_over_time", of=Evidence.of_time),
     Effect("view_dependence", attribute="sh", of=Evidence.of_direction),

@@ -34,9 +34,10 @@ from forewarp.ops.nodes import carry_nodes, pull_nodes, skin_weights, spread_nod
 from forewarp.scene.box import Box, Lattice
 from forewarp.scene.camera import Camera, Lens, Rays
 from forewarp.scene.cloud import Cloud, nearest
-from forewarp.scene.frame import Frame, Scene, instants_of, spread, visual_hull
+from forewarp.scene.frame import Frame, Scene, instants_of, sightings, spread, visual_hull
 
 _FRAMES = 12  # whose silhouettes carve the hull
+_MOSTLY = 0.75  # share of an image's pixels at rest, from which on masks of rest count
 _DRIFT = 0.2  # share of an image's width by which a silhouette is taken to move in all the time there is
 _ROUGH, _FINE = 48, 112  # voxels along the mean side of the box, and of what is left of it
 _FEW = 16  # points that are too few to begin with
@@ -134,6 +135,24 @@ def hull_surface(scene: Scene, frames: list[int], count: int) -> Cloud | None:
 def _grown(mask: Tensor) -> Tensor:
     """Make a mask (X, Y, Z) one voxel wider on all sides; beyond its faces is nothing."""
     return torch.nn.functional.max_pool3d(mask[None, None].float(), 3, 1, 1)[0, 0] > 0
+
+
+def at_rest(scene: Scene, points: Tensor) -> Tensor:
+    """Tell which points (N, 3) of the canonical state rest in the whole film, by masks of its images: bool.
+
+    None does where masks do not say so of most of an image: what seems to rest there creeps, as clothes do.
+    Else what moves in none of the first images rests, too, where no mask of rest shows it.
+    """
+    rests = torch.zeros(len(points), dtype=torch.bool)
+    near = sorted(scene.train, key=lambda frame: abs(frame.time - scene.canonical_time))[:_FRAMES]
+    known = [frame for frame in near if frame.load_resting is not None]
+    masks = [frame.load_resting() for frame in known]
+    if not masks or sum(float(mask.float().mean()) for mask in masks) < _MOSTLY * len(masks):
+        return rests
+    at_rest, looked = sightings(points, [frame.camera for frame in known], masks)
+    moving = [torch.zeros(1, 1) > 0 if frame.load_moving is None else frame.load_moving() for frame in near]
+    moves, seen = sightings(points, [frame.camera for frame in near], moving)
+    return (seen > 0) & (2 * at_rest >= looked) & (2 * moves <= seen)
 
 
 def covered_pixels(scene: Scene, frames: list[int]) -> float:
