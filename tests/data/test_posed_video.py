@@ -366,7 +366,7 @@ def test_what_moves_is_written_and_read_at_every_scale(tmp_path, made):
             f.time,
             moving=f.load_moving().numpy(),
             resting=moving if i == 4 else None,
-        )  # fmt: skip
+        )
         for i, f in enumerate(data.scene.train)
     ]
     write_scene(tmp_path / "again", shots, near=0.1, far=9.0, seconds=4.5, moving_from="a friend")

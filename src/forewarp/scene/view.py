@@ -153,10 +153,11 @@ class Observation:
         valid, the image stays as it is.
         """
         camera = self.view.camera
-        whole, small = ((c.height, c.width) for c in (camera, camera.resized(*_divided(camera, times))))
+        small = camera.resized(*(max(1, round(side / times)) for side in (camera.width, camera.height)))
+        whole, size = (camera.height, camera.width), (small.height, small.width)
 
         def averaged(planes: Tensor) -> Tensor:
-            mean = torch.nn.functional.interpolate(planes.reshape(1, -1, *whole), small, mode="area")
+            mean = torch.nn.functional.interpolate(planes.reshape(1, -1, *whole), size, mode="area")
             return mean.reshape(len(planes), -1)
 
         rgba = self.rgb.T.float()
@@ -169,14 +170,8 @@ class Observation:
                 return self
         if sensed is not None:
             planes = sensed.reshape(1, -1, *whole)
-            sensed = torch.nn.functional.interpolate(planes, small, mode="nearest-exact").reshape(2, -1)
-        view = View(camera.resized(small[1], small[0]))
-        return replace(self, view=view, rgb=rgba, valid=valid, sensed=sensed)
-
-
-def _divided(camera: Camera, times: float) -> tuple[int, int]:
-    """Return the width and height of an image that is so many times smaller."""
-    return max(1, round(camera.width / times)), max(1, round(camera.height / times))
+            sensed = torch.nn.functional.interpolate(planes, size, mode="nearest-exact").reshape(2, -1)
+        return replace(self, view=View(small), rgb=rgba, valid=valid, sensed=sensed)
 
 
 @dataclass(frozen=True)

@@ -150,8 +150,10 @@ def at_rest(scene: Scene, points: Tensor) -> Tensor:
     if not masks or sum(float(mask.float().mean()) for mask in masks) < _MOSTLY * len(masks):
         return rests
     at_rest, looked = sightings(points, [frame.camera for frame in known], masks)
-    moving = [torch.zeros(1, 1) > 0 if frame.load_moving is None else frame.load_moving() for frame in near]
-    moves, seen = sightings(points, [frame.camera for frame in near], moving)
+    cameras = [frame.camera for frame in near]
+    none = [torch.zeros(camera.height, camera.width, dtype=torch.bool) for camera in cameras]
+    moving = [frame.load_moving() if frame.load_moving else mask for frame, mask in zip(near, none)]
+    moves, seen = sightings(points, cameras, moving)
     return (seen > 0) & (2 * at_rest >= looked) & (2 * moves <= seen)
 
 
