@@ -203,8 +203,10 @@ def test_each_number_of_a_method_is_taken_where_it_is_keyed(model):
     fast, faithful = composed(*hypernerf), composed(*hypernerf, "preset=faithful")
     assert [c.preset.bases for c in (fast, faithful)] == [8, 25]  # of the preset, for an experiment
     assert [c.objective.fine.weights.static_points for c in (fast, faithful)] == [1e-2, 0]  # printed: none
-    assert (fast.preset.rays, faithful.budget.iterations) == (4096, 120000)
+    assert (fast.preset.rays, faithful.budget.iterations) == (1024, 120000)
     assert fast.stage.fine.num_voxels[-1][1] == 343000
+    assert fast.stage.coarse.effects == []  # at rest first
+    assert "motion" in faithful.stage.coarse.effects
     assert composed("scene=specimen_band", f"model={model}").stage.fine.num_voxels == [[0, 15625]]
 
 

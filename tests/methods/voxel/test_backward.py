@@ -1,5 +1,6 @@
 from functools import partial
 
+import pytest
 import torch
 
 from forewarp.methods.voxel.backward import Deformation
@@ -11,13 +12,13 @@ from tests.support.tiny_scene import BOX, backward_model, built, camera_at
 LATTICE = Lattice(BOX, (24, 20, 18))
 
 
-def build(shift=(0.0, 0.0, 0.0), frames=5):
+def build(shift=(0.0, 0.0, 0.0), frames=5, **numbers):
     """A method in which matter moves by ``shift`` right after its canonical time, 0.3."""
     torch.manual_seed(0)
     active = torch.zeros(LATTICE.shape, dtype=torch.bool)
     active[3:7, 3:7, 3:6] = True
     model = backward_model(deformation=partial(Deformation, width=16, layers=2))
-    method = built(model, LATTICE, active, frames=frames, canonical_time=0.3)
+    method = built(model, LATTICE, active, frames=frames, canonical_time=0.3, **numbers)
     for parameter in method.radiance.rows():
         torch.nn.init.normal_(parameter, mean=2.0)
     if method.deformation is not None:
@@ -25,8 +26,9 @@ def build(shift=(0.0, 0.0, 0.0), frames=5):
     return method
 
 
-def test_one_time_builds_no_deformation():
-    method, points = build(frames=1), torch.rand(4, 3)
+@pytest.mark.parametrize("still", [{"frames": 1}, {"effects": ["background"]}])
+def test_one_time_or_a_stage_at_rest_builds_no_deformation(still):
+    method, points = build(**still), torch.rand(4, 3)
     assert method.deformation is None
     assert torch.equal(method.trajectories(points, torch.rand(2)), points[:, None].expand(4, 2, 3))
 

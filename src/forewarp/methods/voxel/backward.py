@@ -108,7 +108,8 @@ class BackwardWarp(VoxelMethod):
 
     Args:
         start: scene, stage and numbers (see ``VoxelStage``).
-        deformation: makes what displaces samples to the canonical time; not used in a static scene.
+        deformation: makes what displaces samples to the canonical time; nothing does in a static scene
+            or in a stage without the effect ``motion``.
         shared: radiance, view_dependence, background and renderer: see ``VoxelMethod``.
     """
 
@@ -121,7 +122,7 @@ class BackwardWarp(VoxelMethod):
             )
         super().__init__(start, **shared)
         scene = start.scene
-        self.moves = len(scene.times) > 1
+        self.moves = "motion" in self.stage.effects and len(scene.times) > 1
         self.deformation = deformation(scene.box, canonical_time=scene.canonical_time) if self.moves else None
         self.begin(start)
 
