@@ -153,6 +153,16 @@ def test_carrying_into_a_stage_with_more_effects():
     torch.testing.assert_close(after.radiance.color.data, torch.full_like(after.radiance.color, 0.5))
 
 
+def test_a_background_that_only_the_second_stage_has_starts_faint():
+    model = forward_model(background=EVERYTHING["background"])
+    before = fresh(model, effects=["motion"])
+    assert before.background is None
+    after = carried(before, left(before), model, start_alpha=0.2)
+    grid = after.background()
+    alpha = grid.activation.alpha(grid.raw_density, grid.lattice.voxel_size)
+    torch.testing.assert_close(alpha, torch.full_like(alpha, 0.2))
+
+
 def test_carrying_a_network():
     model = forward_model(radiance=FEATURES)
     before = fresh(model)

@@ -198,6 +198,8 @@ class VoxelMethod(Method):
                 if place in grids and grid.lattice != grids[place].lattice:
                     empty = dict.fromkeys(grid.names, 0.0)
                     grid.resample(grids[place].lattice, grids[place].index >= 0, empty)
+            for key in self.grids.keys() - before.grids.keys():  # a background that only this stage has
+                self.grids[key].fill(self.stage.start_alpha)
             ours, theirs = self.state_dict(), before.state_dict()
             alike = {k: v for k, v in theirs.items() if torch.is_tensor(v) and k in ours}
             self.load_state_dict(ours | {k: v for k, v in alike.items() if v.shape == ours[k].shape})
