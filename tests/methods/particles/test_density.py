@@ -235,11 +235,11 @@ def test_what_masks_say_rests_in_a_film_follows_no_node(share):
     assert bool(method.resting[at_rest == seen].all()) == (share == 0.9)
     assert not bool(method.resting[moving == seen].any())
     assert bool(method.resting.any()) == (share == 0.9)
+    assert int(method.skinning.shares[method.resting].count_nonzero()) == 0
     scene = replace(scene, train=tuple(replace(frame, load_moving=None) for frame in scene.train))
     data = SceneDataModule(lambda: scene, rays=1)  # nothing is known to move
     data.setup("fit")
     assert bool(module_with(data, numbers={"rest_by_masks": True}).method.resting.any()) == (share == 0.9)
-    assert int(method.skinning.shares[method.resting].count_nonzero()) == 0
 
 
 @pytest.mark.parametrize(("covered", "least"), [(1e6, 0.02), (100.0, 0.5013)])

@@ -151,8 +151,8 @@ def at_rest(scene: Scene, points: Tensor) -> Tensor:
         return rests
     at_rest, looked = sightings(points, [frame.camera for frame in known], masks)
     cameras = [frame.camera for frame in near]
-    none = [torch.zeros(camera.height, camera.width, dtype=torch.bool) for camera in cameras]
-    moving = [frame.load_moving() if frame.load_moving else mask for frame, mask in zip(near, none)]
+    nowhere = [torch.zeros(camera.height, camera.width, dtype=torch.bool) for camera in cameras]
+    moving = [frame.load_moving() if frame.load_moving else mask for frame, mask in zip(near, nowhere)]
     moves, seen = sightings(points, cameras, moving)
     return (seen > 0) & (2 * at_rest >= looked) & (2 * moves <= seen)
 
