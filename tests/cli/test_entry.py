@@ -7,11 +7,14 @@ from importlib.metadata import version
 from types import SimpleNamespace
 
 import pytest
+from hydra import initialize_config_dir
+from hydra.core.global_hydra import GlobalHydra
+from hydra.errors import HydraException
 from lightning.pytorch.loggers import mlflow
 from omegaconf import OmegaConf
 
 from forewarp.cli import entry
-from forewarp.cli.mistakes import one_line, with_run_key
+from forewarp.cli.mistakes import one_line, unknown_key, with_run_key
 from forewarp.data.files import SceneError
 from tests.support.configs import CONF, ROOT, options
 
@@ -120,6 +123,15 @@ def test_options_of_ones_own_stand_beside_ours(ok, in_tmp):
 def test_a_mistyped_command_ends_in_one_line(refused, in_tmp, arguments, line):
     assert line in refused("train", *arguments, "paths.data=data")
     assert list(in_tmp.iterdir()) == []
+
+
+def test_naming_a_key_leaves_hydra_to_the_other_jobs_of_a_sweep():
+    error = HydraException("Could not override 'budgt'")
+    GlobalHydra.instance().clear()
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        of_sweep = GlobalHydra.instance().hydra
+        assert "did you mean budget?" in unknown_key(error, "train", ["budgt=fast"])
+        assert GlobalHydra.instance().hydra is of_sweep
 
 
 @pytest.mark.slow

@@ -90,6 +90,15 @@ def test_auto_fits_a_scene_that_stands_still_without_what_it_does_not_call_for(
     assert "fine: finished before" in forewarp("train", *typed, "effects=auto").out
 
 
+def test_a_sweep_plans_the_method_of_its_file(ok, scenes, in_tmp):
+    short = ["budget.iterations=4", "budget.minutes=null", "evaluate=false", "hydra.sweeper.scenes=['seed=1']"]
+    scene = [*TINY, f"data.root={scenes}", "data.scene=vehicle"]
+    ok("train", "--multirun", "sweeps=effects", "ablation=auto", *scene, *VOXELS[1:], *short)
+    (file,) = in_tmp.glob("runs/vehicle/plan-*/plan.yaml")
+    made = yaml.safe_load(file.read_text())
+    assert (made["overrides"][0], made["effects"]["motion"]["choice"]) == ("model=forward", "dct")
+
+
 def test_whole_images_get_the_effects_of_whole_images(ok, scenes, in_tmp, monkeypatch):
     monkeypatch.setattr("forewarp.methods.effect.CUT_OUT", 2.0)
     typed = ["model=forward", *TINY, f"data.root={scenes}", "data.scene=vehicle"]

@@ -130,17 +130,21 @@ def _composed(name: str, arguments: list[str]):
     from hydra.core.global_hydra import GlobalHydra
     from hydra.core.override_parser.overrides_parser import OverridesParser
 
+    of_sweep = GlobalHydra.instance().hydra  # the other jobs need it
     GlobalHydra.instance().clear()
     dirs = [one.partition("=")[2] for one in arguments if one.startswith("--config-dir=")]
     dirs += [after for before, after in zip(arguments, arguments[1:]) if before == "--config-dir"]
     more = [f"hydra.searchpath=[{','.join(f'file://{Path(d).resolve()}' for d in dirs)}]"] if dirs else []
-    with hydra.initialize_config_dir(str(configurations()), version_base="1.3"):
-        with suppress(Exception):
-            typed = [one for one in arguments if one[:1] == "~" or ("=" in one and one[:1] != "-")]
-            parsed = OverridesParser.create().parse_overrides(typed)
-            one_job = [override.input_line for override in parsed if not override.is_sweep_override()]
-            return hydra.compose(name, [*more, *one_job])
-        return hydra.compose(name)
+    try:
+        with hydra.initialize_config_dir(str(configurations()), version_base="1.3"):
+            with suppress(Exception):
+                typed = [one for one in arguments if one[:1] == "~" or ("=" in one and one[:1] != "-")]
+                parsed = OverridesParser.create().parse_overrides(typed)
+                one_job = [override.input_line for override in parsed if not override.is_sweep_override()]
+                return hydra.compose(name, [*more, *one_job])
+            return hydra.compose(name)
+    finally:
+        GlobalHydra.instance().hydra = of_sweep
 
 
 def _every_key(node, prefix: str = "") -> Iterator[str]:

@@ -38,13 +38,16 @@ def plan(config) -> None:
 def planned():
     """Make or read a plan of what was typed; return the config of the run that the plan says."""
     from hydra import compose
+    from hydra.core.hydra_config import HydraConfig
 
     from forewarp.planning.plan import make_plan
     from forewarp.planning.plan_file import own_folder, show_plan
-    from forewarp.runs.overrides import merged, typed_overrides, without_switched_off
+    from forewarp.runs.overrides import key_of, merged, typed_overrides, without_switched_off
 
-    typed = typed_overrides(of_sweep=True)
-    made = make_plan(compose("train", typed), typed_overrides())
+    typed, of_job = typed_overrides(of_sweep=True), typed_overrides()
+    if of_job != typed and "model" not in map(key_of, of_job):  # the sweep's file may name it
+        of_job = [f"model={HydraConfig.get().runtime.choices['model']}", *of_job]
+    made = make_plan(compose("train", typed), of_job)
     show_plan(made, to_fit=False)
     config = compose("train", without_switched_off(merged([*made["overrides"], *own_folder(typed)], typed)))
     config.planned = made["file"]
