@@ -33,6 +33,7 @@ OF_PARTICLES = [
     ("model/view_dependence", "harmonics"),
     ("model/color_over_time", "cosines"),
     ("model/opacity_over_time", "cosines"),
+    ("model/exposure", "cosines"),
     ("model/background", "still"),
 ]
 OFF = [("inpainter", "unet3d"), ("upsampler", "learned"), ("view_dependence", "mlp"), ("motion", "dct")]

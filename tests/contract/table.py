@@ -12,6 +12,7 @@ from forewarp.methods.ndvg import NDVG
 from forewarp.methods.nerf import NeRF
 from forewarp.methods.nerfies import Nerfies
 from forewarp.methods.neural_volumes import NeuralVolumes
+from forewarp.methods.particles import exposure
 from forewarp.methods.particles.model import Particles
 from forewarp.methods.particles.nodes import Nodes
 from forewarp.methods.rays import Marching, Sampling
@@ -107,11 +108,12 @@ OF_PARTICLES = {
     "view_dependence": Effect({"view_dependence": 1}, (), ("sh",)),
     "color_over_time": Effect({"color_over_time": 1}, calls(Particles, "color_basis")),
     "opacity_over_time": Effect({"opacity_over_time": 1}, calls(Particles, "opacity_basis")),
+    "exposure": Effect({"exposure": 1}, calls(exposure, "gain_and_bias", "lit", "to_unlit")),
     "background": Effect({"background": 0.03}, (), ("resting", "nodes.stopped")),
 }
 RATES = {"means": 1.5e-3, "scales": 5e-3, "quaternions": 3e-3, "opacity": 5e-2, "colors": 3e-2, "sh": 1e-3}
 RATES |= {"color_over_time": 1e-3, "opacity_over_time": 3e-3, "skinning": 1e-2, "time_offsets": 0.3}
-RATES |= {"node_translations": 7e-3, "node_rotations": 8e-3}
+RATES |= {"exposure": 1e-3, "node_translations": 7e-3, "node_rotations": 8e-3}
 SMALL_NETWORK = {"width": 32, "layers": 3, "skip": None, "position_frequencies": 4}
 SMALL_NETWORK |= {"sampling": Sampling(16, 16, density="softplus", open_end=False, inside_box=True)}
 SMALL_WARP = {"warp_width": 24, "warp_layers": 3, "warp_skip": None, "still_points": 64}

@@ -60,6 +60,9 @@ def test_the_preset_and_what_is_typed_win():
     motion, rotation = decisions[:2]
     assert (motion.choice, rotation.choice) == ("cosines", "nodes")
     assert motion.because == "as typed; 1 time: nothing can be seen to change"
+    exposure = {"exposure": "cosines"}
+    assert on(PARTICLES, exposure, PICTURES) == {"exposure"}
+    assert on(PARTICLES, exposure, replace(PICTURES, frames=100)) == set()  # each camera has its own
     (opacity,) = (d for d in decide(PARTICLES, Evidence(PICTURES), OF_PARTICLES, {}) if "opacity" in d.effect)
     assert (opacity.choice, opacity.because) == ("none", "off in the preset")
 

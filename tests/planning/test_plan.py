@@ -91,9 +91,9 @@ def test_auto_fits_a_scene_that_stands_still_without_what_it_does_not_call_for(
 
 
 def test_a_sweep_plans_the_method_of_its_file(ok, scenes, in_tmp):
-    short = ["budget.iterations=4", "budget.minutes=null", "evaluate=false", "hydra.sweeper.scenes=['seed=1']"]
-    scene = [*TINY, f"data.root={scenes}", "data.scene=vehicle"]
-    ok("train", "--multirun", "sweeps=effects", "ablation=auto", *scene, *VOXELS[1:], *short)
+    scene = [*TINY, f"data.root={scenes}", "data.scene=vehicle", "hydra.sweeper.scenes=['seed=1']"]
+    short = [*VOXELS[1:], "budget.iterations=4", "budget.minutes=null", "evaluate=false"]
+    ok("train", "--multirun", "sweeps=effects", "ablation=auto", *scene, *short)
     (file,) = in_tmp.glob("runs/vehicle/plan-*/plan.yaml")
     made = yaml.safe_load(file.read_text())
     assert (made["overrides"][0], made["effects"]["motion"]["choice"]) == ("model=forward", "dct")

@@ -13,7 +13,7 @@ from tests.support.tiny_scene import ball_scene
 
 BARE = dict.fromkeys(NAMES)  # no effect at all
 MOVING = BARE | {"motion": "spline", "rotation": True, "view_dependence": 1}
-EVERY = MOVING | {"color_over_time": 2, "opacity_over_time": 2, "background": 0.03}
+EVERY = MOVING | {"color_over_time": 2, "opacity_over_time": 2, "exposure": 1, "background": 0.03}
 FACTORS = {"photo": 1.0, "rigid": 3.0, "smooth": 0.1, "static": 0.05}
 
 

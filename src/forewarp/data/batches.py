@@ -161,7 +161,7 @@ class Sampler(IterableDataset):
         if self.asks.sensed and frame.load_sensed is not None:
             sensed = frame.load_sensed().flatten(1)
             sensed = sensed if rows is None else sensed[:, rows]
-        moment = Moment(frame.time, index, frame.camera_id)
+        moment = Moment(frame.time, index, frame.camera_id, filmed=True)
         return Observation(moment, view, rgb, background, valid, sensed)
 
     def _colors(self, count: int) -> Tensor:

@@ -64,6 +64,14 @@ class Evidence:
         share = self.residual.by_time
         return share > BY_TIME, f"{why}, and time {max(share, 0):.0%} of what a still fit leaves over"
 
+    def of_exposure(self) -> tuple[bool, str]:
+        """Tell whether exposure may drift, and why."""
+        if self.pictures.times < 2:
+            return self.of_time()
+        if self.pictures.frames > self.pictures.times:
+            return False, "several images of a time: each camera has an exposure of its own"
+        return True, f"one image of each of {self.pictures.times} times"
+
     def of_direction(self) -> tuple[bool, str]:
         """Tell whether colour may depend on direction, and why."""
         spread = self.pictures.spread

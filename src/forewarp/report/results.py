@@ -83,6 +83,7 @@ PROTOCOL += (
     "held_out",
     "canonical_time",
     "mask_box",
+    "exposure",
 )  # what pages tell of a run's protocol
 OWN = "run|sheets|paths.runs|paths.data"  # keys that say where a run's files are, not what it is
 # What stands for the folders of whoever types a command again.

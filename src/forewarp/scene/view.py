@@ -20,12 +20,14 @@ _WHOLLY = 0.999  # share of a pixel from which on all of it is valid
 @dataclass(frozen=True)
 class Moment:
     """A ``time`` in [0, 1] and, if known, the index of the training ``frame`` and the id of the physical
-    ``camera`` that took it.
+    ``camera`` that took it. ``filmed``: an image is meant that was taken then, in its light; else the scene
+    alone.
     """
 
     time: float
     frame: int | None = None
     camera: int | None = None
+    filmed: bool = False
 
     __repr__ = brief
 
@@ -244,7 +246,7 @@ class Target:
     @property
     def moment(self) -> Moment:
         """The time and the camera of the image."""
-        return Moment(self.frame.time, self.index, self.frame.camera_id)
+        return Moment(self.frame.time, self.index, self.frame.camera_id, filmed=True)
 
     @property
     def view(self) -> View:

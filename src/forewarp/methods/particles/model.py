@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 
 import torch
@@ -14,7 +14,7 @@ from forewarp.fields.curves import Curve
 from forewarp.fields.moving import GaussiansSnapshot, cosines, pinhole_of
 from forewarp.losses import IMAGE_LOSSES, robust
 from forewarp.methods.method import Method, Snapshot, Start, Step, value_at
-from forewarp.methods.particles import density, queries
+from forewarp.methods.particles import density, exposure, queries
 from forewarp.methods.particles.nodes import Nodes, Skinning, TimeOffsets, are_rows
 from forewarp.methods.particles.options import EFFECTS, SMALLEST, Effects, Numbers, view_share
 from forewarp.methods.particles.shared import begin_window, check_still, left_alone
@@ -46,8 +46,15 @@ _ROWS = ("means", "scales", "quaternions", "opacity", "colors", "sh", "color_ove
 _ROWS += ("gradient_sum", "image_count", "unseen_rounds", "resting", "shared")
 
 
+@dataclass(eq=False, repr=False)
 class ParticlesSnapshot(GaussiansSnapshot, Snapshot):
-    """Particles at a moment."""
+    """Particles at a moment; ``is_lit`` tells whether they are lit as an image that was taken at one."""
+
+    is_lit: Callable[[Moment], bool] = lambda moment: False
+
+    def holds(self, moment: Moment) -> bool:
+        """Return whether it is the same time, in the same light."""
+        return moment.time == self.moment.time and self.is_lit(moment) == self.is_lit(self.moment)
 
 
 class Particles(Method):
@@ -100,6 +107,7 @@ class Particles(Method):
         self.views, times = len(start.scene.train), start.scene.instants
         effects = Effects(**choices).only(self.stage.effects, len(times))
         self.ends = min(times), max(times)
+        self.cameras = {frame.camera_id for frame in start.scene.train}
         self.progress = self.decay = self.hidden_decay = 0.0
         self.shown_now: list[Tensor] = []  # which particles each image of this step showed
         self.small_by, self.small = 1.0, {}  # images made so many times smaller, by frame
@@ -117,6 +125,8 @@ class Particles(Method):
         colors, opacities = effects.color_over_time or 0, effects.opacity_over_time or 0
         self.color_over_time = _coefficients(values.get("color_over_time"), count, colors, 3)
         self.opacity_over_time = _coefficients(values.get("opacity_over_time"), count, opacities)
+        lights = exposure.count_of(effects.exposure or 0, len(times), self.views)
+        self.exposure = _coefficients(values.get("exposure"), lights, 2, 3)
         # Of the rounds of density control; the first two are sums since the last round.
         self.register_buffer("gradient_sum", torch.zeros(count))
         self.register_buffer("image_count", torch.zeros(count))  # that showed a particle
@@ -236,15 +246,32 @@ class Particles(Method):
     def at(self, moment: Moment) -> Snapshot:
         """Move every particle; nothing is rendered yet."""
         warp, bases = self.warp(moment.time), self.time_bases(moment.time)
-        return ParticlesSnapshot(moment, self.gaussians(), warp, *bases, self.blur, self.chunk)
+        gaussians = self.gaussians(self.light(moment.time) if self._is_lit(moment) else None)
+        return ParticlesSnapshot(moment, gaussians, warp, *bases, self.blur, self.chunk, self._is_lit)
 
-    def gaussians(self) -> Gaussians:
-        """Return the particles as the operators read them: coefficients of one kind in one tensor."""
+    def _is_lit(self, moment: Moment) -> bool:
+        """Return whether the exposure of an image counts, taken then by a camera of the training images."""
+        return self.exposure is not None and moment.filmed and moment.camera in self.cameras
+
+    def gaussians(self, light: Tensor | None = None) -> Gaussians:
+        """Return the particles, in a ``light`` or their own, as the operators read them: coefficients of one
+        kind in one tensor.
+        """
         opacity = [self.opacity] if self.opacity_over_time is None else [self.opacity, self.opacity_over_time]
         opacity = opacity[0] if len(opacity) == 1 else torch.cat(opacity, -1)
         colors = [getattr(self, name) for name in self._color_parameters()]
         colors = colors[0] if len(colors) == 1 else torch.cat(colors, 1)
+        colors = colors if light is None else exposure.lit(colors, light)
         return Gaussians(self.means, self.scales, self.quaternions, opacity, colors)
+
+    def light(self, time: float) -> Tensor | None:
+        """Return the gain and the bias of each colour channel in images of a time: (2, 3); None: 1 and 0."""
+        if self.exposure is None:
+            return None
+        return exposure.gain_and_bias(self.exposure, self._drift(time))
+
+    def _drift(self, time: float) -> list[float]:
+        return exposure.basis_at(len(self.exposure), time, self.shared is not None)
 
     def _color_parameters(self) -> list[str]:
         """Return the parameters of colour that there are, in the operators' order."""
@@ -335,12 +362,12 @@ class Particles(Method):
             basis = nodes.summed_basis((motion_time, 1.0))
             motion, maps = nodes.motion_and_maps(basis)
             warp = Warp(maps, self.skinning.links, self.skinning.weights())
-        colors, terms = self._color_parameters(), {}
+        colors, light, terms = self._color_parameters(), self.light(seen.moment.time), {}
         loss = self._image_loss(factors, terms)
         of_colors = factors.get("photo", 0.0) if loss is None else 1.0
         sensed = seen.sensed if "depth" in factors else None
         compared = compare(
-            self.gaussians(), warp, pinhole_of(seen.view.camera, self.blur), *self.time_bases(time),
+            self.gaussians(light), warp, pinhole_of(seen.view.camera, self.blur), *self.time_bases(time),
             seen.rgb, seen.background, width=self.width, factor=of_colors / (covered * views),
             by_skin=self.moves, kinds=[getattr(self, name).shape[1] for name in colors], loss=loss,
             valid=seen.valid, sensed=sensed, by_depth=factors.get("depth", 0.0) / of_colors, deep=self.deep,
@@ -359,6 +386,9 @@ class Particles(Method):
             self.unseen_rounds[density.too_near(compared.order, compared.distances)] = math.inf
         means, scales, quaternions, opacity, by_kind = compared.particles
         gradients = {"means": means, "scales": scales, "quaternions": quaternions, "opacity": opacity[:, :1]}
+        if light is not None:
+            unlit, drift = [getattr(self, name) for name in colors], self._drift(seen.moment.time)
+            by_kind, gradients["exposure"] = exposure.to_unlit(unlit, by_kind, light, drift)
         gradients |= dict(zip(colors, by_kind, strict=True))
         if self.opacity_over_time is not None:
             gradients["opacity_over_time"] = opacity[:, 1:]
@@ -446,6 +476,11 @@ class Particles(Method):
         optimizer.register_step_post_hook(lambda *_: density.decay_opacity(self))
         return optimizer
 
+    def protocol(self) -> dict[str, str]:
+        """See ``Method``."""
+        lit = "gain and bias of test images: of smooth curves over time, learned from training images"
+        return super().protocol() | ({} if self.exposure is None else {"exposure": lit})
+
     def departures(self) -> list[str]:
         """See ``Method``."""
         return [
@@ -454,10 +489,11 @@ class Particles(Method):
 
 
 def _coefficients(before: Tensor | None, *shape: int) -> nn.Parameter | None:
-    """Make an effect's coefficients (N, K, ...): those of the stage before, if it has as many, else 0.
+    """Make an effect's coefficients (N, K, ...), of the exposure (K, 2, 3): those of the stage before, if it
+    has as many, else 0.
 
     None where the effect is off (K = 0).
     """
-    if shape[1] == 0:
+    if 0 in shape[:2]:
         return None
     return nn.Parameter(before if before is not None and before.shape == shape else torch.zeros(shape))

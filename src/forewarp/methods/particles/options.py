@@ -24,6 +24,9 @@ class Effects:
         rotation: True: nodes also rotate what is beside them.
         view_dependence: degree 1 to 3 of the spherical harmonics by which colour depends on direction.
         color_over_time, opacity_over_time: number of cosines over time of each particle's colour and opacity.
+        exposure: number of cosines over time of the gain and the bias of all colours, as of a film whose
+            exposure or white balance drifts; at most one for four times, none where a time has several
+            images.
         background: share of the scene's extent. Nodes that move (and, by rotating, move what is beside them)
             no farther than that from their mean position, or than a pixel, come to rest; particles that
             follow no others need no nodes any more.
@@ -37,6 +40,7 @@ class Effects:
     view_dependence: int | None = 1
     color_over_time: int | None = 2
     opacity_over_time: int | None = None
+    exposure: int | None = None
     background: float | None = 0.03
 
     def __post_init__(self) -> None:
@@ -46,6 +50,7 @@ class Effects:
             ("view_dependence", "a degree of 1 to 3", lambda choice: _is_count(choice) and choice <= 3),
             ("color_over_time", "a number of cosines >= 1", _is_count),
             ("opacity_over_time", "a number of cosines >= 1", _is_count),
+            ("exposure", "a number of cosines >= 1", _is_count),
             ("background", "a number > 0", lambda choice: is_number(choice) and choice > 0),
         ):
             choice = getattr(self, name)
@@ -207,5 +212,6 @@ EFFECTS = (
     Effect("background", attribute="nodes.stopped", needs="motion"),
     Effect("opacity_over_time", of=Evidence.of_time),
     Effect("color_over_time", of=Evidence.of_time),
+    Effect("exposure", of=Evidence.of_exposure),
     Effect("view_dependence", attribute="sh", of=Evidence.of_direction),
 )

@@ -37,7 +37,7 @@ def check_still(before: Method) -> None:
         ValueError: for one that is not made of particles, or whose particles change over time, unless it is
             of a window itself.
     """
-    over_time = ("nodes", "color_over_time", "opacity_over_time")
+    over_time = ("nodes", "color_over_time", "opacity_over_time", "exposure")
     stands = hasattr(before, "shared") and all(getattr(before, name) is None for name in over_time)
     if not stands and getattr(before, "shared", None) is None:
         raise ValueError(
