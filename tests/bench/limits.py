@@ -155,7 +155,7 @@ def _projection(length: int, pixels: float) -> Tensor:
 
 FITTED = {
     "motion": ("node_translations", "node_rotations"),
-    "colours": ("colors", "sh", "color_over_time"),
+    "colours": ("colors", "sh", "color_over_time", "exposure"),
     "opacity": ("opacity", "opacity_over_time"),
     "places and shapes": ("means", "scales", "quaternions"),
 }

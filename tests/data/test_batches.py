@@ -163,7 +163,7 @@ def test_crops_are_square_parts_of_an_image_over_one_colour(scene, background):
         assert crop.background.shape == (3,)
         image = scene.train[batch.frame].load()[top : top + 3, left : left + 3].reshape(-1, 4)
         torch.testing.assert_close(crop.rgb, composited(image, crop.background))
-        assert crop.moment == Moment(scene.train[batch.frame].time, batch.frame, crop.moment.camera)
+        assert crop.moment == Moment(scene.train[batch.frame].time, batch.frame, filmed=True)
         corners.add((top, left))
     assert corners == {(top, left) for top in range(4) for left in range(6)}  # of 6 x 8 pixels
     (whole,) = Sampler(scene, asks=Asks("crops", side=7)).draw().observations

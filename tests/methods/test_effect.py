@@ -10,7 +10,7 @@ from forewarp.methods.voxel.backward import BackwardWarp
 from forewarp.methods.voxel.structure import EFFECTS as VOXELS
 from forewarp.scene.frame import Survey
 
-PICTURES = Survey(frames=50, times=50, cut_out=0.8, spread=160.0, disagreement=0.02)
+PICTURES = Survey(frames=50, times=50, cut_out=0.8, spread=160.0, disagreement=0.02, one_camera=True)
 QUIET = replace(PICTURES, disagreement=0.0)
 NODES = {"motion": "spline", "rotation": "nodes", "background": "still"}
 OF_PARTICLES = NODES | {"color_over_time": "cosines", "view_dependence": "harmonics"}
@@ -62,7 +62,7 @@ def test_the_preset_and_what_is_typed_win():
     assert motion.because == "as typed; 1 time: nothing can be seen to change"
     exposure = {"exposure": "cosines"}
     assert on(PARTICLES, exposure, PICTURES) == {"exposure"}
-    assert on(PARTICLES, exposure, replace(PICTURES, frames=100)) == set()  # each camera has its own
+    assert on(PARTICLES, exposure, replace(PICTURES, one_camera=False)) == set()  # each camera has its own
     (opacity,) = (d for d in decide(PARTICLES, Evidence(PICTURES), OF_PARTICLES, {}) if "opacity" in d.effect)
     assert (opacity.choice, opacity.because) == ("none", "off in the preset")
 

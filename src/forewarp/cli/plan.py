@@ -45,7 +45,8 @@ def planned():
     from forewarp.runs.overrides import key_of, merged, typed_overrides, without_switched_off
 
     typed, of_job = typed_overrides(of_sweep=True), typed_overrides()
-    if of_job != typed and "model" not in map(key_of, of_job):  # the sweep's file may name it
+    keys = [*map(key_of, typed)]
+    if "sweeps" in keys and "model" not in keys:  # the sweep's file may name it
         of_job = [f"model={HydraConfig.get().runtime.choices['model']}", *of_job]
     made = make_plan(compose("train", typed), of_job)
     show_plan(made, to_fit=False)

@@ -13,6 +13,7 @@ CUT_OUT = 0.001  # share of transparent pixels below which the scene has a backg
 # scenes those that stand still have 0.0 %, the others from 0.37 % (things that appear) on.
 STILL = 0.001
 ENOUGH = 40  # images from which on it counts that nothing is seen to change
+FEWEST_TIMES = 4  # that tell a drift of exposure
 NARROW = 15.0  # degrees between the most different cameras below which direction cannot be observed
 # Least shares of what a short still fit leaves over that time, and direction, explain. After ``still_steps``
 # time explains -0.10 to -0.04 of scenes that stand still and 0.03 to 0.20 where the light moves: anything at
@@ -66,11 +67,11 @@ class Evidence:
 
     def of_exposure(self) -> tuple[bool, str]:
         """Tell whether exposure may drift, and why."""
-        if self.pictures.times < 2:
-            return self.of_time()
-        if self.pictures.frames > self.pictures.times:
-            return False, "several images of a time: each camera has an exposure of its own"
-        return True, f"one image of each of {self.pictures.times} times"
+        if not self.pictures.one_camera:
+            return False, "several cameras, each of which has an exposure of its own"
+        times = self.pictures.times
+        few = "" if times >= FEWEST_TIMES else ", too few to tell a drift"
+        return not few, f"one camera, {times} times{few}"
 
     def of_direction(self) -> tuple[bool, str]:
         """Tell whether colour may depend on direction, and why."""

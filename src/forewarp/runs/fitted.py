@@ -105,11 +105,11 @@ class Renderable:
         camera = view if frame is None else frame.camera
         if not isinstance(camera, Camera):
             camera = replace(self.cameras[0], camera_to_world=_rigid(camera))
-        filmed = frame is not None and time in (None, frame.time)
         time = frame.time if time is None and frame is not None else time
         if not isinstance(time, int | float | np.number | Tensor) or np.ndim(time) or not 0 <= time <= 1:
             raise ValueError(f"time: expected a number in [0, 1], but got {time}")
         behind = self.background if background is None else _color(background)
+        filmed = frame is not None and float(time) == frame.time
         moment = Moment(float(time), None, None if frame is None else frame.camera_id, filmed)
         with torch.no_grad():
             if self._snapshot is None or not self._snapshot.holds(moment):

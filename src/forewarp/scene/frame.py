@@ -99,6 +99,12 @@ class Scene:
         """The distinct times of ``instants_of`` the training frames, ascending."""
         return tuple(sorted({*instants_of(self.train)}))
 
+    @property
+    def has_one_camera(self) -> bool:
+        """Whether one camera took all training images; where no dataset tells, there is one of most times."""
+        cameras = {frame.camera_id for frame in self.train}
+        return len(cameras) == 1 and len(self.train) < 2 * len(self.instants)
+
 
 def instants_of(frames: Sequence[Frame]) -> list[float]:
     """Return the time of the instant that each frame belongs to: the mean of those of one ``moment``, or its
@@ -200,7 +206,8 @@ def walk_of(scene: Scene) -> tuple[float, float | None] | None:
 class Survey:
     """Properties of the training images.
 
-    ``times``: distinct times of the ``frames``. ``cut_out``: share of transparent pixels, 0 without alpha.
+    ``times``: distinct times of the ``frames``; ``one_camera``: one took them all. ``cut_out``: share of
+    transparent pixels, 0 without alpha.
     ``spread``: largest angle between two cameras, seen from the scene's middle, degrees. ``disagreement``:
     share of the foreground that no static object can explain, as no point of the visual hull projects there
     (0 without alpha).
@@ -211,6 +218,7 @@ class Survey:
     cut_out: float
     spread: float
     disagreement: float
+    one_camera: bool
 
 
 def survey(scene: Scene) -> Survey:
@@ -226,7 +234,8 @@ def survey(scene: Scene) -> Survey:
     least = min(float((towards @ row).min()) for row in towards)
     angle = math.degrees(math.acos(max(-1.0, min(1.0, least))))
     disagreement = _disagreement(scene, frames) if cut_out > 0 and len(frames) > 1 else 0.0
-    return Survey(len(scene.train), len(scene.times), cut_out, angle, disagreement)
+    seen = len(scene.train), len(scene.times), cut_out, angle, disagreement
+    return Survey(*seen, scene.has_one_camera)
 
 
 def _disagreement(scene: Scene, frames: Sequence[Frame]) -> float:

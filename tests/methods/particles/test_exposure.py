@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from forewarp.data.module import SceneDataModule
-from forewarp.methods.particles.exposure import basis_at, gain_and_bias
+from forewarp.methods.particles.exposure import basis_at, count_of, gain_and_bias, lit, to_unlit
 from forewarp.methods.particles.model import Particles
 from forewarp.metrics.image import psnr
 from forewarp.scene.view import Moment, View
@@ -56,7 +56,8 @@ def test_a_drift_is_told_from_the_scene_and_held_out_images_are_lit_by_it(tmp_pa
             drawn = method.at(target.moment).render(View(target.frame.camera), target.background).rgb
             scores.append(psnr(drawn.detach().reshape(target.rgb.shape), target.rgb))
         if name == "with":
-            lights = [method.light(time).detach() for time in (0.0, 0.25, 0.5)]
+            moments = [Moment(time, filmed=True) for time in (0.0, 0.25, 0.5)]
+            lights = [method.light(moment).detach() for moment in moments]
             greys = torch.stack([0.4 * gain + bias for gain, bias in lights]).mean(1)
             expected = torch.tensor([drift(time) for time in (0.0, 0.25, 0.5)])
             torch.testing.assert_close(greys / greys[1], expected, atol=0.12, rtol=0)
@@ -75,6 +76,25 @@ def test_only_images_of_the_cameras_that_filmed_are_lit():
     assert not torch.equal(drawn(Moment(0.0, filmed=True)), scene)
     assert torch.equal(drawn(Moment(0.0, camera=7, filmed=True)), scene)
     assert not method.at(Moment(0.0)).holds(Moment(0.0, filmed=True))
+
+
+def test_gradients_lead_back_as_those_of_autograd():
+    draw = partial(torch.randn, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    colors, asked, basis = [draw(7, 1, 3), draw(7, 3, 3)], draw(7, 4, 3), [1.0, 0.4, -0.7]
+    leaves = [t.requires_grad_() for t in (*colors, 0.1 * draw(3, 2, 3))]
+    light = gain_and_bias(leaves[2], basis)
+    expected = torch.autograd.grad((lit(torch.cat(leaves[:2], 1), light) * asked).sum(), leaves)
+    with torch.no_grad():
+        by_colors, by_exposure = to_unlit(leaves[:2], asked.split([1, 3], 1), light, basis)
+    torch.testing.assert_close((*by_colors, by_exposure), expected)
+
+
+def test_cameras_that_film_together_have_exposures_of_their_own():
+    scene = ball_scene(frames=8)
+    assert count_of(12, scene) == 2
+    rig = replace(scene, train=tuple(replace(f, camera_id=i % 2) for i, f in enumerate(scene.train)))
+    together = replace(scene, train=(*scene.train, *scene.train))
+    assert count_of(12, rig) == count_of(12, together) == 0
 
 
 def test_the_scene_itself_is_lit_as_its_film_is_on_average():

@@ -8,20 +8,16 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from forewarp.methods.effect import FEWEST_TIMES
 from forewarp.ops.gaussians import FLAT
+from forewarp.scene.frame import Scene
 
-_APART = 4  # times for each cosine, at least: fewer would let a single image have a light of its own
 
-
-def count_of(asked: int, times: int, images: int) -> int:
-    """Return how many cosines there are, of those asked for, in a scene of so many times and training images.
-
-    Of several images of a time each would have a camera, and an exposure, of its own: then there are none.
-
-    >>> count_of(12, 125, 125), count_of(12, 22, 22), count_of(12, 3, 3), count_of(12, 125, 250)
-    (12, 5, 0, 0)
+def count_of(asked: int, scene: Scene) -> int:
+    """Return how many cosines there are, of those asked for: at most one for ``FEWEST_TIMES`` times, and none
+    where several cameras film, each of which has an exposure of its own.
     """
-    return min(asked, times // _APART) if images == times else 0
+    return min(asked, len(scene.instants) // FEWEST_TIMES) if scene.has_one_camera else 0
 
 
 def basis_at(count: int, time: float, is_window: bool) -> list[float]:

@@ -48,13 +48,14 @@ _ROWS += ("gradient_sum", "image_count", "unseen_rounds", "resting", "shared")
 
 @dataclass(eq=False, repr=False)
 class ParticlesSnapshot(GaussiansSnapshot, Snapshot):
-    """Particles at a moment; ``is_lit`` tells whether they are lit as an image that was taken at one."""
+    """Particles at a moment; images that the cameras ``lit`` have filmed have a light of their own."""
 
-    is_lit: Callable[[Moment], bool] = lambda moment: False
+    lit: frozenset[int | None] = frozenset()
 
     def holds(self, moment: Moment) -> bool:
         """Return whether it is the same time, in the same light."""
-        return moment.time == self.moment.time and self.is_lit(moment) == self.is_lit(self.moment)
+        lit = [seen.filmed and seen.camera in self.lit for seen in (moment, self.moment)]
+        return moment.time == self.moment.time and lit[0] == lit[1]
 
 
 class Particles(Method):
@@ -107,7 +108,6 @@ class Particles(Method):
         self.views, times = len(start.scene.train), start.scene.instants
         effects = Effects(**choices).only(self.stage.effects, len(times))
         self.ends = min(times), max(times)
-        self.cameras = {frame.camera_id for frame in start.scene.train}
         self.progress = self.decay = self.hidden_decay = 0.0
         self.shown_now: list[Tensor] = []  # which particles each image of this step showed
         self.small_by, self.small = 1.0, {}  # images made so many times smaller, by frame
@@ -125,8 +125,9 @@ class Particles(Method):
         colors, opacities = effects.color_over_time or 0, effects.opacity_over_time or 0
         self.color_over_time = _coefficients(values.get("color_over_time"), count, colors, 3)
         self.opacity_over_time = _coefficients(values.get("opacity_over_time"), count, opacities)
-        lights = exposure.count_of(effects.exposure or 0, len(times), self.views)
-        self.exposure = _coefficients(values.get("exposure"), lights, 2, 3)
+        lights = exposure.count_of(effects.exposure or 0, start.scene)
+        self.exposure = _coefficients(values.get("exposure"), lights, 2, 3) if lights else None
+        self.lit = frozenset(frame.camera_id for frame in start.scene.train if lights)
         # Of the rounds of density control; the first two are sums since the last round.
         self.register_buffer("gradient_sum", torch.zeros(count))
         self.register_buffer("image_count", torch.zeros(count))  # that showed a particle
@@ -246,12 +247,8 @@ class Particles(Method):
     def at(self, moment: Moment) -> Snapshot:
         """Move every particle; nothing is rendered yet."""
         warp, bases = self.warp(moment.time), self.time_bases(moment.time)
-        gaussians = self.gaussians(self.light(moment.time) if self._is_lit(moment) else None)
-        return ParticlesSnapshot(moment, gaussians, warp, *bases, self.blur, self.chunk, self._is_lit)
-
-    def _is_lit(self, moment: Moment) -> bool:
-        """Return whether the exposure of an image counts, taken then by a camera of the training images."""
-        return self.exposure is not None and moment.filmed and moment.camera in self.cameras
+        gaussians = self.gaussians(self.light(moment))
+        return ParticlesSnapshot(moment, gaussians, warp, *bases, self.blur, self.chunk, self.lit)
 
     def gaussians(self, light: Tensor | None = None) -> Gaussians:
         """Return the particles, in a ``light`` or their own, as the operators read them: coefficients of one
@@ -264,11 +261,13 @@ class Particles(Method):
         colors = colors if light is None else exposure.lit(colors, light)
         return Gaussians(self.means, self.scales, self.quaternions, opacity, colors)
 
-    def light(self, time: float) -> Tensor | None:
-        """Return the gain and the bias of each colour channel in images of a time: (2, 3); None: 1 and 0."""
-        if self.exposure is None:
+    def light(self, moment: Moment) -> Tensor | None:
+        """Return the gain and the bias (2, 3) of the colour channels of an image that a training camera has
+        filmed; None, which is 1 and 0, for any other.
+        """
+        if not (moment.filmed and moment.camera in self.lit):
             return None
-        return exposure.gain_and_bias(self.exposure, self._drift(time))
+        return exposure.gain_and_bias(self.exposure, self._drift(moment.time))
 
     def _drift(self, time: float) -> list[float]:
         return exposure.basis_at(len(self.exposure), time, self.shared is not None)
@@ -362,7 +361,7 @@ class Particles(Method):
             basis = nodes.summed_basis((motion_time, 1.0))
             motion, maps = nodes.motion_and_maps(basis)
             warp = Warp(maps, self.skinning.links, self.skinning.weights())
-        colors, light, terms = self._color_parameters(), self.light(seen.moment.time), {}
+        colors, light, terms = self._color_parameters(), self.light(seen.moment), {}
         loss = self._image_loss(factors, terms)
         of_colors = factors.get("photo", 0.0) if loss is None else 1.0
         sensed = seen.sensed if "depth" in factors else None
@@ -489,11 +488,10 @@ class Particles(Method):
 
 
 def _coefficients(before: Tensor | None, *shape: int) -> nn.Parameter | None:
-    """Make an effect's coefficients (N, K, ...), of the exposure (K, 2, 3): those of the stage before, if it
-    has as many, else 0.
+    """Make an effect's coefficients (N, K, ...): those of the stage before, if it has as many, else 0.
 
     None where the effect is off (K = 0).
     """
-    if 0 in shape[:2]:
+    if shape[1] == 0:
         return None
     return nn.Parameter(before if before is not None and before.shape == shape else torch.zeros(shape))

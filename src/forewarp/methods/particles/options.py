@@ -25,8 +25,7 @@ class Effects:
         view_dependence: degree 1 to 3 of the spherical harmonics by which colour depends on direction.
         color_over_time, opacity_over_time: number of cosines over time of each particle's colour and opacity.
         exposure: number of cosines over time of the gain and the bias of all colours, as of a film whose
-            exposure or white balance drifts; at most one for four times, none where a time has several
-            images.
+            exposure or white balance drifts; at most one for four times, none where several cameras film.
         background: share of the scene's extent. Nodes that move (and, by rotating, move what is beside them)
             no farther than that from their mean position, or than a pixel, come to rest; particles that
             follow no others need no nodes any more.

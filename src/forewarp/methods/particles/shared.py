@@ -37,7 +37,7 @@ def check_still(before: Method) -> None:
         ValueError: for one that is not made of particles, or whose particles change over time, unless it is
             of a window itself.
     """
-    over_time = ("nodes", "color_over_time", "opacity_over_time", "exposure")
+    over_time = ("nodes", "color_over_time", "opacity_over_time")
     stands = hasattr(before, "shared") and all(getattr(before, name) is None for name in over_time)
     if not stands and getattr(before, "shared", None) is None:
         raise ValueError(
@@ -71,6 +71,7 @@ def begin_window(still: Particles, start: Start, share: float) -> tuple[dict[str
         own[:_FEW] = True
     moving_pixels = max(sum(pixels) / len(pixels), float(_FEW))
     values = {name: p.data.to("cpu", copy=True) for name, p in still.named_parameters(recurse=False)}
+    values.pop("exposure", None)  # its times are those of the whole film
     fresh = _on_what_moves(still, start, round(share * still.stage.final_count(moving_pixels, still.views)))
     if fresh:
         count = len(fresh["means"])
@@ -114,7 +115,7 @@ def wrong_pixels(still: Particles, frame: Frame) -> Tensor:
     """Return which pixels (H, W) of an image ``still`` does not show, and what is beside them."""
     rgba = frame.load().float() / 255
     view, black = View(frame.camera), torch.zeros(3)
-    drawn = still.at(Moment(frame.time, camera=frame.camera_id)).render(view, black).rgb
+    drawn = still.at(Moment(frame.time, camera=frame.camera_id, filmed=True)).render(view, black).rgb
     height, width = frame.camera.height, frame.camera.width
     error = (drawn.reshape(height, width, 3) - rgba[..., :3] * rgba[..., 3:]).abs().mean(-1)
     smooth = torch.nn.functional.avg_pool2d(error[None, None], 3, 1, 1, count_include_pad=False)[0, 0]
