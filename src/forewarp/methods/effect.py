@@ -61,7 +61,8 @@ class Evidence:
             return True, f"{why}; without silhouettes, motion is taken for granted"
         why += f"; a static shape explains all but {self.pictures.disagreement:.1%} of the silhouettes"
         if self.residual is None:
-            return True, why + (", and no fit was long enough to tell more" if self.silhouettes_rest else "")
+            short = ", and no fit was long enough to tell more: raise budget.minutes"
+            return True, why + (short if self.silhouettes_rest else "")
         share = self.residual.by_time
         return share > BY_TIME, f"{why}, and time {max(share, 0):.0%} of what a still fit leaves over"
 

@@ -477,7 +477,7 @@ class Particles(Method):
 
     def protocol(self) -> dict[str, str]:
         """See ``Method``."""
-        lit = "gain and bias of test images: of smooth curves over time, learned from training images"
+        lit = "gain and bias of test images of the film: of smooth curves over time, learned in training"
         return super().protocol() | ({} if self.exposure is None else {"exposure": lit})
 
     def departures(self) -> list[str]:
