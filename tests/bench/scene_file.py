@@ -16,7 +16,7 @@ from forewarp.export.tracks import Source, no_progress
 from forewarp.metrics.image import psnr
 from forewarp.runs.config import saved_config
 from forewarp.runs.fitted import open_file, opened
-from forewarp.scene.view import View
+from forewarp.scene.view import Moment, View
 
 
 def row(folder: str) -> str:
@@ -40,7 +40,7 @@ def row(folder: str) -> str:
         images, view = [], View(target.frame.camera)
         with torch.no_grad():
             for shown in (module.method, held):
-                drawn = shown.at(target.moment).render(view, target.background)
+                drawn = shown.at(Moment(target.frame.time)).render(view, target.background)
                 images.append(drawn.rgb.clamp(0, 1).reshape(target.rgb.shape))
         values.append([psnr(image, target.rgb) for image in images] + [psnr(*images)])
     of_run, of_file, apart = (fmean(column) for column in zip(*values))

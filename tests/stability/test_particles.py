@@ -193,16 +193,8 @@ def test_places_behind_a_lens():
 
 
 # Of which parameters: without view dependence and lens all there are; with either those that move nothing.
-STILL = {
-    "scales",
-    "quaternions",
-    "opacity",
-    "colors",
-    "sh",
-    "color_over_time",
-    "opacity_over_time",
-    "exposure",
-}
+STILL = {"scales", "quaternions", "opacity", "colors", "sh", "color_over_time", "opacity_over_time"}
+STILL |= {"exposure"}
 MOVING = {"means", "nodes.translations", "nodes.rotations", "skinning.logits"}
 METHODS = {
     "splines": ({"view_dependence": None}, {}, STILL - {"sh"} | MOVING),

@@ -13,7 +13,7 @@ CUT_OUT = 0.001  # share of transparent pixels below which the scene has a backg
 # scenes those that stand still have 0.0 %, the others from 0.37 % (things that appear) on.
 STILL = 0.001
 ENOUGH = 40  # images from which on it counts that nothing is seen to change
-FEWEST_TIMES = 4  # that tell a drift of exposure
+DRIFT_TIMES = 4  # of training for each cosine of a drift of exposure; fewer tell nothing of it
 NARROW = 15.0  # degrees between the most different cameras below which direction cannot be observed
 # Least shares of what a short still fit leaves over that time, and direction, explain. After ``still_steps``
 # time explains -0.10 to -0.04 of scenes that stand still and 0.03 to 0.20 where the light moves: anything at
@@ -71,7 +71,7 @@ class Evidence:
         if not self.pictures.one_camera:
             return False, "several cameras, each of which has an exposure of its own"
         times = self.pictures.times
-        few = "" if times >= FEWEST_TIMES else ", too few to tell a drift"
+        few = "" if times >= DRIFT_TIMES else ", too few to tell a drift"
         return not few, f"one camera, {times} times{few}"
 
     def of_direction(self) -> tuple[bool, str]:

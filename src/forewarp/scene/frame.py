@@ -101,7 +101,7 @@ class Scene:
 
     @property
     def has_one_camera(self) -> bool:
-        """Whether one camera took all training images; where no dataset tells, there is one of most times."""
+        """Whether one camera took all training images: none has an id of its own, and most times have one."""
         cameras = {frame.camera_id for frame in self.train}
         return len(cameras) == 1 and len(self.train) < 2 * len(self.instants)
 
@@ -206,11 +206,10 @@ def walk_of(scene: Scene) -> tuple[float, float | None] | None:
 class Survey:
     """Properties of the training images.
 
-    ``times``: distinct times of the ``frames``; ``one_camera``: one took them all. ``cut_out``: share of
-    transparent pixels, 0 without alpha.
+    ``times``: distinct times of the ``frames``. ``cut_out``: share of transparent pixels, 0 without alpha.
     ``spread``: largest angle between two cameras, seen from the scene's middle, degrees. ``disagreement``:
     share of the foreground that no static object can explain, as no point of the visual hull projects there
-    (0 without alpha).
+    (0 without alpha). ``one_camera``: as ``Scene.has_one_camera``.
     """
 
     frames: int
@@ -234,8 +233,7 @@ def survey(scene: Scene) -> Survey:
     least = min(float((towards @ row).min()) for row in towards)
     angle = math.degrees(math.acos(max(-1.0, min(1.0, least))))
     disagreement = _disagreement(scene, frames) if cut_out > 0 and len(frames) > 1 else 0.0
-    seen = len(scene.train), len(scene.times), cut_out, angle, disagreement
-    return Survey(*seen, scene.has_one_camera)
+    return Survey(len(scene.train), len(scene.times), cut_out, angle, disagreement, scene.has_one_camera)
 
 
 def _disagreement(scene: Scene, frames: Sequence[Frame]) -> float:

@@ -20,8 +20,8 @@ _WHOLLY = 0.999  # share of a pixel from which on all of it is valid
 @dataclass(frozen=True)
 class Moment:
     """A ``time`` in [0, 1] and, if known, the index of the training ``frame`` and the id of the physical
-    ``camera`` that took it. ``filmed``: an image is meant that was taken then, in its light; else the scene
-    alone.
+    ``camera`` that took it. ``filmed``: an image is meant that was taken then, with its exposure; else
+    the scene alone.
     """
 
     time: float

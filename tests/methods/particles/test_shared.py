@@ -113,6 +113,16 @@ def test_a_window_begins_from_particles_that_stand_still_alone(still):
     assert begun(still).shared is not None
 
 
+def test_a_window_learns_its_exposure_anew(monkeypatch):
+    """Curves over the times of the whole film say something else at a window's times."""
+    monkeypatch.setattr(shared, "_on_what_moves", lambda *given: {})
+    before = module_with(DATA, **(BARE | {"exposure": 1})).method
+    before.exposure.data.fill_(0.1)
+    window = begun(before, **(BARE | {"exposure": 1}))
+    assert before.exposure.shape == window.exposure.shape
+    assert not bool(window.exposure.any())
+
+
 def test_pixels_are_wrong_where_an_image_shows_something_else():
     method = module_with(DATA, **BARE).method
     method.opacity.data.fill_(-9.0)  # nothing is drawn

@@ -8,16 +8,16 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from forewarp.methods.effect import FEWEST_TIMES
+from forewarp.methods.effect import DRIFT_TIMES
 from forewarp.ops.gaussians import FLAT
 from forewarp.scene.frame import Scene
 
 
 def count_of(asked: int, scene: Scene) -> int:
-    """Return how many cosines there are, of those asked for: at most one for ``FEWEST_TIMES`` times, and none
+    """Return how many cosines there are, of those asked for: at most one for ``DRIFT_TIMES`` times, and none
     where several cameras film, each of which has an exposure of its own.
     """
-    return min(asked, len(scene.instants) // FEWEST_TIMES) if scene.has_one_camera else 0
+    return min(asked, len(scene.instants) // DRIFT_TIMES) if scene.has_one_camera else 0
 
 
 def basis_at(count: int, time: float, is_window: bool) -> list[float]:

@@ -48,13 +48,13 @@ _ROWS += ("gradient_sum", "image_count", "unseen_rounds", "resting", "shared")
 
 @dataclass(eq=False, repr=False)
 class ParticlesSnapshot(GaussiansSnapshot, Snapshot):
-    """Particles at a moment; images that the cameras ``lit`` have filmed have a light of their own."""
+    """Particles at a moment. Images that the ``lit_cameras`` took have an exposure of their own."""
 
-    lit: frozenset[int | None] = frozenset()
+    lit_cameras: frozenset[int | None] = frozenset()
 
     def holds(self, moment: Moment) -> bool:
         """Return whether it is the same time, in the same light."""
-        lit = [seen.filmed and seen.camera in self.lit for seen in (moment, self.moment)]
+        lit = [seen.filmed and seen.camera in self.lit_cameras for seen in (moment, self.moment)]
         return moment.time == self.moment.time and lit[0] == lit[1]
 
 
@@ -127,7 +127,7 @@ class Particles(Method):
         self.opacity_over_time = _coefficients(values.get("opacity_over_time"), count, opacities)
         lights = exposure.count_of(effects.exposure or 0, start.scene)
         self.exposure = _coefficients(values.get("exposure"), lights, 2, 3) if lights else None
-        self.lit = frozenset(frame.camera_id for frame in start.scene.train if lights)
+        self.lit_cameras = frozenset(frame.camera_id for frame in start.scene.train if lights)
         # Of the rounds of density control; the first two are sums since the last round.
         self.register_buffer("gradient_sum", torch.zeros(count))
         self.register_buffer("image_count", torch.zeros(count))  # that showed a particle
@@ -248,7 +248,7 @@ class Particles(Method):
         """Move every particle; nothing is rendered yet."""
         warp, bases = self.warp(moment.time), self.time_bases(moment.time)
         gaussians = self.gaussians(self.light(moment))
-        return ParticlesSnapshot(moment, gaussians, warp, *bases, self.blur, self.chunk, self.lit)
+        return ParticlesSnapshot(moment, gaussians, warp, *bases, self.blur, self.chunk, self.lit_cameras)
 
     def gaussians(self, light: Tensor | None = None) -> Gaussians:
         """Return the particles, in a ``light`` or their own, as the operators read them: coefficients of one
@@ -262,10 +262,10 @@ class Particles(Method):
         return Gaussians(self.means, self.scales, self.quaternions, opacity, colors)
 
     def light(self, moment: Moment) -> Tensor | None:
-        """Return the gain and the bias (2, 3) of the colour channels of an image that a training camera has
-        filmed; None, which is 1 and 0, for any other.
+        """Return the gain and the bias (2, 3) of the colours of an image that a camera of the training images
+        took; None for any other: gain 1, bias 0.
         """
-        if not (moment.filmed and moment.camera in self.lit):
+        if not (moment.filmed and moment.camera in self.lit_cameras):
             return None
         return exposure.gain_and_bias(self.exposure, self._drift(moment.time))
 
