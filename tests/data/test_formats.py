@@ -309,7 +309,6 @@ OPTIONS = {
         ({"near": 200}, "expected near < far, but got 200 and 120; set data.near, data.far"),
         ({"far": 0}, "data.far: expected a number"),
         ({"normalise": "yes"}, "data.normalise: expected true or false, but got 'yes'"),
-        ({"canonical": "last"}, "data.canonical: expected middle or first, but got 'last'"),
         ({"test_every": 1}, "data.test_every: expected a whole number of at least 2, but got 1"),
     ],
 }

@@ -181,13 +181,15 @@ def test_the_middle_training_time_becomes_canonical_and_leads_the_trajectories()
     assert torch.equal(moved.truth.points, scene.truth.points[:, [2, 0, 1, 3]])
     assert with_canonical(moving(0.0, 1.0), "middle").truth is None
     assert with_canonical(scene, None) is scene
-    for choice, time in ((0.0, 0.0), (0.3, 0.25), (0.45, 0.5), (1, 1.0)):  # the nearest
+    for choice, time in (("first", 0.0), (0.0, 0.0), (0.3, 0.25), (0.45, 0.5), (1, 1.0)):  # the nearest
         assert with_canonical(scene, choice).canonical_time == time
 
 
 @pytest.mark.parametrize("word", ["last", 1.5, -0.1, True, float("nan")])
 def test_another_canonical_time_is_refused(word):
-    with pytest.raises(SceneError, match="data.canonical: expected middle, spread, a time in .0, 1. or null"):
+    with pytest.raises(
+        SceneError, match="data.canonical: expected first, middle, spread, a time in .0, 1. or"
+    ):
         with_canonical(moving(0.0), word)
 
 

@@ -177,7 +177,6 @@ def test_given_times_are_kept(tmp_path, made):
     assert [frames_of(scene)[f"images/frame_{i + 1}"].time for i in range(10)] == times
     assert [f.time for f in scene.test] == [0.35]  # the fifth in time
     assert scene.canonical_time == 0.5
-    assert read_scene(tmp_path, "toy", canonical="first").canonical_time == 0.0
     assert scene.protocol["times"] == "as given"
 
 

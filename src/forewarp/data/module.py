@@ -93,7 +93,7 @@ def with_canonical(scene: Scene, canonical: str | float | None) -> Scene:
 
     Args:
         scene: as read.
-        canonical: ``middle``, the time nearest to the middle; ``spread``, the one whose silhouettes are most
+        canonical: ``first``; ``middle``, the time nearest to the middle; ``spread``, the one whose silhouettes are most
             spread out (``spread_time``; ``middle`` where images have no alpha); a time in [0, 1]: the
             training time nearest to it; None changes nothing.
 
@@ -103,10 +103,12 @@ def with_canonical(scene: Scene, canonical: str | float | None) -> Scene:
     if canonical is None:
         return scene
     is_time = isinstance(canonical, int | float) and not isinstance(canonical, bool) and 0 <= canonical <= 1
-    if canonical not in ("middle", "spread") and not is_time:
-        raise mismatch("data.canonical", "middle, spread, a time in [0, 1] or null", repr(canonical))
+    if canonical not in ("first", "middle", "spread") and not is_time:
+        raise mismatch("data.canonical", "first, middle, spread, a time in [0, 1] or null", repr(canonical))
     if is_time:
         time = min(scene.times, key=lambda t: abs(t - canonical))
+    elif canonical == "first":
+        time = scene.times[0]
     else:
         time = spread_time(scene) if canonical == "spread" and scene.has_alpha else middle_of(scene.times)
     truth = None
@@ -356,7 +358,7 @@ class MulticamDataModule(_FolderDataModule):
 
 
 class PosedVideoDataModule(_FolderDataModule):
-    """A capture with poses, as ``posed_video.read_scene`` reads it; ``canonical`` is the reader's."""
+    """A capture with poses, as ``posed_video.read_scene`` reads it."""
 
     _reader = _described_by = staticmethod(posed_video.read_scene)
     suspects = (

@@ -118,7 +118,6 @@ def read_scene(
     far: float | None = None,
     box: Sequence[float] | None = None,
     normalise: bool = True,
-    canonical: str = "middle",
     test_every: int = 8,
     test_cameras: Sequence[str | int] | None = None,
     test_moments: Sequence[int] | None = None,
@@ -143,7 +142,6 @@ def read_scene(
         near, far: along the unit ray, the file's units; None takes the file's or derives them.
         box: x0 y0 z0 x1 y1 z1 in the file's units; None takes the file's ``aabb``, or all that is seen.
         normalise: put what is looked at into the origin and the farthest camera at distance 1.
-        canonical: the training time nearest to the ``middle``, or the ``first``.
         test_every: every n-th frame is a test frame, the first and the last never, where the file does not
             list ``<split>_filenames``.
         test_cameras: names of the cameras held out, of frames that have ``camera``; None: see above.
@@ -172,8 +170,6 @@ def read_scene(
         raise mismatch("data.masks", f"one of {', '.join(MASKS)} or null", repr(masks))
     if type(scale) is not int or scale not in SCALES:
         raise mismatch("data.scale", f"one of {SCALES}", repr(scale))
-    if canonical not in ("middle", "first"):
-        raise mismatch("data.canonical", "middle or first", repr(canonical))
     whole(test_every, "data.test_every", 2)
     if not isinstance(normalise, bool):
         raise mismatch("data.normalise", "true or false", repr(normalise))
@@ -257,7 +253,7 @@ def read_scene(
         train, test = split_rig(((moments[f.name], f) for f in train), *held)
     if not isinstance(moving_from := content.get("moving_from", "moving_path of the frames"), str):
         raise mismatch(f"{file}: moving_from", "text", short(moving_from))
-    start = (min if canonical == "first" else middle_of)([frame.time for frame in train])
+    start = middle_of(frame.time for frame in train)
     protocol = {
         "dataset": "video_with_poses",
         "resolution": [train[0].camera.width, train[0].camera.height],
