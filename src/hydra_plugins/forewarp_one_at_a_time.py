@@ -18,7 +18,7 @@ class OneAtATime(BasicSweeper):
         scenes: likewise for each scene; of no effect where the command line chooses one.
 
     Raises:
-        ValueError: if there is no change, and so no job.
+        ValueError: if there is no change or no scene, and so no job.
     """
 
     def __init__(
@@ -29,10 +29,11 @@ class OneAtATime(BasicSweeper):
         scenes: Sequence[str] = ("",),
     ) -> None:
         super().__init__(max_batch_size, params)
-        if not changes:
-            raise ValueError(
-                "hydra.sweeper.changes: expected at least one change, but got []; use [''] for the plain job"
-            )
+        for name, given in (("changes", changes), ("scenes", scenes)):
+            if not given:
+                raise ValueError(
+                    f"hydra.sweeper.{name}: expected at least one, but got []; use [''] for the job as it is"
+                )
         self.changes, self.scenes = changes, scenes
 
     def split_arguments(self, overrides, max_batch_size):
@@ -50,9 +51,9 @@ def changed(jobs: Sequence[Sequence[str]], changes: Sequence[str]) -> list[list[
     >>> changed([["seed=0", "preset=fast"]], ["", "preset=demo", "preset.nodes=0 model=backward"])[1:]
     [['seed=0', 'preset=demo'], ['seed=0', 'preset=fast', 'preset.nodes=0', 'model=backward']]
     """
-    from forewarp.runs.overrides import merged  # not above: Hydra reads this file in every application
+    from forewarp.runs.overrides import merged, with_experiment  # not above: every application reads this
 
-    return [merged(job, shlex.split(change)) for change in changes for job in jobs]
+    return [merged(job, with_experiment(shlex.split(change))) for change in changes for job in jobs]
 
 
 def scenes_left(scenes: Sequence[str], typed: Iterable[str]) -> list[str]:
@@ -61,11 +62,12 @@ def scenes_left(scenes: Sequence[str], typed: Iterable[str]) -> list[str]:
     >>> scenes_left(["experiment=dnerf data.scene=hook", "experiment=dnerf data.scene=lego"], ["data.scene"])
     ['experiment=dnerf']
     """
-    from forewarp.runs.overrides import key_of
+    from forewarp.runs.overrides import key_of, with_experiment
 
     if {"experiment", "scene"} & {*typed}:
         return [""]
-    kept = [" ".join(word for word in scene.split() if key_of(word) not in typed) for scene in scenes]
+    listed = map(with_experiment, map(str.split, scenes))
+    kept = [" ".join(word for word in scene if key_of(word) not in typed) for scene in listed]
     return list(dict.fromkeys(kept))
 
 

@@ -113,7 +113,11 @@ def test_options_of_ones_own_stand_beside_ours(ok, in_tmp):
         (["model=forward", "+model.renderer.bogus=1"], "model.renderer: "),
         (
             ["--multirun", "hydra/sweeper=one_at_a_time", "hydra.sweeper.changes=[]"],
-            "at least one change, but got []",
+            "hydra.sweeper.changes: expected at least one, but got []",
+        ),
+        (
+            ["--multirun", "sweeps=dnerf", "hydra.sweeper.scenes=[]"],
+            "hydra.sweeper.scenes: expected at least",
         ),
         (["preset=compact"], "preset: expected demo, fast or faithful, as compact is of model=forward"),
         (["model=tnerf", "ablation=base"], "model: expected forward or backward or particles, which base is"),

@@ -93,9 +93,9 @@ def with_canonical(scene: Scene, canonical: str | float | None) -> Scene:
 
     Args:
         scene: as read.
-        canonical: ``first``; ``middle``, the time nearest to the middle; ``spread``, the one whose silhouettes are most
-            spread out (``spread_time``; ``middle`` where images have no alpha); a time in [0, 1]: the
-            training time nearest to it; None changes nothing.
+        canonical: ``first``; ``middle``, the time nearest to the middle; ``spread``, the one whose
+            silhouettes are most spread out (``spread_time``; ``middle`` where images have no alpha); a time
+            in [0, 1]: the training time nearest to it; None changes nothing.
 
     Raises:
         SceneError: for anything else.
