@@ -51,9 +51,9 @@ def changed(jobs: Sequence[Sequence[str]], changes: Sequence[str]) -> list[list[
     >>> changed([["seed=0", "preset=fast"]], ["", "preset=demo", "preset.nodes=0 model=backward"])[1:]
     [['seed=0', 'preset=demo'], ['seed=0', 'preset=fast', 'preset.nodes=0', 'model=backward']]
     """
-    from forewarp.runs.overrides import merged, with_experiment  # not above: every application reads this
+    from forewarp.runs.overrides import merged  # not above: Hydra reads this file in every application
 
-    return [merged(job, with_experiment(shlex.split(change))) for change in changes for job in jobs]
+    return [merged(job, shlex.split(change)) for change in changes for job in jobs]
 
 
 def scenes_left(scenes: Sequence[str], typed: Iterable[str]) -> list[str]:
@@ -62,12 +62,11 @@ def scenes_left(scenes: Sequence[str], typed: Iterable[str]) -> list[str]:
     >>> scenes_left(["experiment=dnerf data.scene=hook", "experiment=dnerf data.scene=lego"], ["data.scene"])
     ['experiment=dnerf']
     """
-    from forewarp.runs.overrides import key_of, with_experiment
+    from forewarp.runs.overrides import key_of
 
     if {"experiment", "scene"} & {*typed}:
         return [""]
-    listed = map(with_experiment, map(str.split, scenes))
-    kept = [" ".join(word for word in scene if key_of(word) not in typed) for scene in listed]
+    kept = [" ".join(word for word in scene.split() if key_of(word) not in typed) for scene in scenes]
     return list(dict.fromkeys(kept))
 
 

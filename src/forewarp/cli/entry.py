@@ -19,7 +19,7 @@ import forewarp
 from forewarp.cli.mistakes import flat, one_line, options_last, refuse_dashes, unknown_key, with_run_key
 from forewarp.runs import overrides
 from forewarp.runs.config_files import configurations, installed, project_root
-from forewarp.runs.overrides import as_text, command_of_job, is_sweep, key_of, with_experiment
+from forewarp.runs.overrides import as_text, command_of_job, is_sweep, key_of
 from forewarp.runs.windows import commands_of, scores_of
 
 TRACEBACK_VARIABLE = "FOREWARP_TRACEBACK"
@@ -79,7 +79,7 @@ def _arguments(name: str) -> list[str]:
     """
     arguments = as_text(with_run_key(name, sys.argv[1:]))
     if name in ("train", "plan"):
-        arguments = with_experiment(arguments)
+        arguments = [re.sub(r"^dataset=", "experiment=", argument) for argument in arguments]
         for seeds in (argument[6:] for argument in arguments if argument.startswith("seeds=")):
             if not re.fullmatch("[1-9][0-9]*", seeds):  # of none Hydra would run nothing, and say nothing
                 raise ValueError(f"seeds: expected a whole number of at least 1, but got {seeds}")

@@ -137,15 +137,6 @@ def key_of(override: str) -> str:
     return override.split("=")[0].lstrip("+~")
 
 
-def with_experiment(words: Sequence[str]) -> list[str]:
-    """Return overrides with ``experiment=NAME`` for ``dataset=NAME``: the same where scenes are trained on.
-
-    >>> with_experiment(["dataset=dnerf", "data.scene=hook"])
-    ['experiment=dnerf', 'data.scene=hook']
-    """
-    return [re.sub("^dataset=", "experiment=", word) for word in words]
-
-
 def merged(overrides: Sequence[str], later: Sequence[str]) -> list[str]:
     """Join two lists of overrides; a later one replaces an earlier one of the same key.
 
