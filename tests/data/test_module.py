@@ -180,7 +180,7 @@ def test_the_middle_training_time_becomes_canonical_and_leads_the_trajectories()
     assert moved.truth.times.tolist() == [0.5, 0.0, 0.25, 1.0]
     assert torch.equal(moved.truth.points, scene.truth.points[:, [2, 0, 1, 3]])
     assert with_canonical(moving(0.0, 1.0), "middle").truth is None
-    assert with_canonical(scene, None) is scene
+    assert with_canonical(scene, None) is with_canonical(scene, "first") is scene  # as it was
     for choice, time in (("first", 0.0), (0.0, 0.0), (0.3, 0.25), (0.45, 0.5), (1, 1.0)):  # the nearest
         assert with_canonical(scene, choice).canonical_time == time
 

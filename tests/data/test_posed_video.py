@@ -176,8 +176,11 @@ def test_given_times_are_kept(tmp_path, made):
     scene = made(times=times)
     assert [frames_of(scene)[f"images/frame_{i + 1}"].time for i in range(10)] == times
     assert [f.time for f in scene.test] == [0.35]  # the fifth in time
-    assert scene.canonical_time == 0.5
     assert scene.protocol["times"] == "as given"
+    for canonical, time in ((None, 0.5), ("middle", 0.5), ("first", 0.0), (0.85, 0.8)):
+        read = PosedVideoDataModule(root=tmp_path, scene="toy", canonical=canonical).scene
+        assert read.canonical_time == time
+        assert read.protocol.get("canonical_time") == (None if time == 0.5 else time)  # that of the format
 
 
 HELD = [(10, 2, [2, 4, 6, 8]), (10, 3, [2, 5, 8]), (13, 8, [5]), (21, 8, [5, 13]), (5, 8, [4]), (3, 8, [2])]

@@ -248,6 +248,11 @@ def test_a_scene_with_one_kind_of_view_is_measured_by_it(tmp_path):
     assert "nhr, 512x384 and 1024x768, background white" in protocols
 
 
+def test_a_canonical_time_of_zero_is_told(tmp_path):
+    paper_run(tmp_path, "hook", protocol={"canonical_time": 0.0})
+    assert [*read_runs(tmp_path)[0].by("protocol")] == ["dnerf, 4x3, background white, canonical time 0.0"]
+
+
 def test_a_column_that_names_no_kind_of_view_has_its_kind_in_the_protocol(tmp_path):
     both = {"space": {"psnr": 20.0}, "canonical": {"psnr": 21.0}}
     few = {"measured": "2 of 20 test views, evenly spread"}

@@ -95,7 +95,8 @@ def with_canonical(scene: Scene, canonical: str | float | None) -> Scene:
         scene: as read.
         canonical: ``first``; ``middle``, the time nearest to the middle; ``spread``, the one whose
             silhouettes are most spread out (``spread_time``; ``middle`` where images have no alpha); a time
-            in [0, 1]: the training time nearest to it; None changes nothing.
+            in [0, 1]: the training time nearest to it. None changes nothing, nor does the time that is
+            canonical already.
 
     Raises:
         SceneError: for anything else.
@@ -111,6 +112,8 @@ def with_canonical(scene: Scene, canonical: str | float | None) -> Scene:
         time = scene.times[0]
     else:
         time = spread_time(scene) if canonical == "spread" and scene.has_alpha else middle_of(scene.times)
+    if time == scene.canonical_time:
+        return scene
     truth = None
     if scene.truth is not None and bool((scene.truth.times - time).abs().min() < _SAME_TIME):
         order = ((scene.truth.times - time).abs() >= _SAME_TIME).argsort(stable=True)

@@ -322,7 +322,8 @@ def read_run(folder: Path) -> Row:
         typed = re.search(rf"\sstage\.fine\.{key}=(\S+)", command)
         row[key] = number(typed[1]) if typed else None
 
-    told = [f"{key.replace('_', ' ')} {_text(protocol[key])}" for key in PROTOCOL if protocol.get(key)]
+    known = [key for key in PROTOCOL if protocol.get(key) or (key == "canonical_time" and key in protocol)]
+    told = [f"{key.replace('_', ' ')} {_text(protocol[key])}" for key in known]
     row["pictures"] = pictures_in_words(protocol)
     words = [dataset, row["pictures"] or "background unknown", *told, protocol.get("note")]
     row["protocol"] = ", ".join(filter(None, words))
