@@ -238,7 +238,7 @@ REFUSED = [
         {"iterations_per_time": 0},
         "x.iterations_per_time: expected a whole number >= 1, but got 0",
     ),
-    (curriculum, {"most": 0}, "x.most: expected at least 1 or null, but got 0"),
+    (curriculum, {"most": 0}, "x.most: expected a whole number >= 1, but got 0"),
     *((curriculum, {key: value}, "x: expected start >= 1, ") for key, value in BAD_SHARES.items()),
 ]
 
