@@ -51,7 +51,7 @@ def test_it_says_where_the_page_is_and_ends_with_ctrl_c(ok, fitted):
         ([], "run: expected the folder of a run, but got nothing; set run=runs/..."),
         (["run2=nowhere", "run={run}"], "expected the configuration of a run, but got none; set run2="),
         (["size=3", "run={run}"], "size: expected a whole number of at least 16, but got 3"),
-        (["points=none", "run={run}"], "points: expected a whole number of at least 1, but got none"),
+        (["points=none", "run={run}"], "points: expected a whole number of at least 1, but got 'none'"),
         (["tail=2", "run={run}"], "tail: expected a number in .0.01, 1., but got 2"),
     ],
 )
