@@ -43,6 +43,7 @@ import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -52,10 +53,8 @@ from forewarp.cli.entry import INTERRUPTED, MISTAKE, project_root
 from forewarp.runs.overrides import merged
 
 # Keys that may be typed, with what they are where they are left out.
-KEYS = dict.fromkeys(
-    shlex.split("data scenes methods model preset minutes steps seeds sweeps changes views out"), ""
-)
-KEYS |= {"jobs": "2", "threads": "", "launcher": "", "device": "gpu", "more": "", "small": ""}
+KEYS = shlex.split("data scenes methods model preset minutes steps seeds sweeps changes views out threads")
+KEYS = dict.fromkeys([*KEYS, "launcher", "more", "small"], "") | {"jobs": "2", "device": "gpu"}
 TABLES = ["dnerf", "hypernerf", "nhr", "lego_complete"]
 ABLATIONS = ["ablation_modules", "ablation_losses"]
 # Sweeps and the counterparts they run on without data, in two lanes of about the same length, a core each.
@@ -112,6 +111,17 @@ class Keys(SimpleNamespace):
         seeds = self.seeds or default
         return [] if not seeds else [f"seed={seeds}" if "," in seeds else f"seeds={seeds}"]
 
+    def of_two(self) -> str:
+        """Return the model, which is one of two.
+
+        Raises:
+            ValueError: for another one.
+        """
+        model = self.model or "particles"
+        if model not in ("particles", "forward"):
+            raise ValueError(f"model: expected particles or forward, but got {model}")
+        return model
+
 
 @dataclass
 class Job:
@@ -151,8 +161,9 @@ def _made_small(job: Job) -> Job:
         moved = [word.replace("out=docs/", "out=runs/").replace("runs/", "runs/small/") for word in command]
         return moved if moved != command else [*moved, "paths.runs=runs/small"]
 
-    lanes = [[shortened(sweep) for sweep in lane] for lane in job.lanes]
-    return Job(lanes, [apart(command) for command in job.then], job.jobs, job.small)
+    job.lanes = [[shortened(sweep) for sweep in lane] for lane in job.lanes]
+    job.then = [apart(command) for command in job.then]
+    return job
 
 
 def words(text: str) -> list[str]:
@@ -188,10 +199,8 @@ def tables(keys: Keys) -> Job:
     if not keys.data and keys.sweeps not in ("", "all", "ablations"):
         raise ValueError(f"sweeps: expected all or ablations without data=, but got {keys.sweeps}")
     if "methods" in sweeps and not scenes:
-        raise ValueError(
-            "scenes: expected scenes=hook,... beside sweeps=methods, but got none; "
-            "methods=all fits all scenes by all methods"
-        )
+        advice = "methods=all fits all scenes by all methods"
+        raise ValueError(f"scenes: expected scenes=hook,... beside sweeps=methods, but got none; {advice}")
     preset = keys.preset or ("fast" if keys.data else "demo")
     minutes = keys.minutes or ("null" if preset == "faithful" else "5" if keys.data else "1")
     base = [f"preset={preset}", *_until(minutes, keys.steps), *(keys.drawn("1")), "score=null"]
@@ -224,18 +233,14 @@ def _models(methods: str, sweep: str) -> Sweep:
 def _counterparts(sweeps: str, base: Sweep, keys: Keys) -> list[list[Sweep]]:
     """Return the sweeps of counterparts in two lanes: the tables', those of ``ablations``, or ``all``."""
     left_out = {"": [*ABLATIONS, "resolution"], "ablations": [*TABLES, "methods", "resolution"], "all": []}
-    lanes, base = [], [*base, "budget.clock=processor", "threads=1"]
-    for lane in LANES:
-        pairs = [pair.split(":") for pair in lane.split()]
-        lanes.append(
-            [
-                [*base, f"sweeps={sweep}", f"scene=counterpart_{data}", *_models(keys.methods, sweep)]
-                + (ROOM if sweeps == "ablations" and data == "hypernerf" else [])
-                for sweep, data in pairs
-                if sweep not in left_out[sweeps]
-            ]
-        )
-    return lanes
+    base = [*base, "budget.clock=processor", "threads=1"]
+
+    def of_pair(sweep: str, data: str) -> Sweep:
+        room = ROOM if sweeps == "ablations" and data == "hypernerf" else []
+        return [*base, f"sweeps={sweep}", f"scene=counterpart_{data}", *_models(keys.methods, sweep), *room]
+
+    lanes = [[pair.split(":") for pair in lane.split()] for lane in LANES]
+    return [[of_pair(*pair) for pair in lane if pair[0] not in left_out[sweeps]] for lane in lanes]
 
 
 def ablations(keys: Keys) -> Job:
@@ -243,24 +248,17 @@ def ablations(keys: Keys) -> Job:
     if keys.preset == "compact":
         return _at_rest(keys)
     if keys.data or keys.methods:
-        raise ValueError(
-            "data, methods: expected none, as ablations are of model=forward on counterparts, but got some; "
-            f"of real scenes: forewarp-reproduce tables data={keys.data or 'FOLDER'} sweeps=ablations"
-        )
+        expected = "data, methods: expected none, as ablations are of model=forward on counterparts"
+        advice = f"of real scenes: forewarp-reproduce tables data={keys.data or 'FOLDER'} sweeps=ablations"
+        raise ValueError(f"{expected}, but got some; {advice}")
     common = [f"preset={keys.preset or 'demo'}", f"views={keys.views or 9}", "score=null", *keys.drawn("2")]
-    by_minutes, by_steps = (
-        _counterparts("ablations", [*common, *until, *OF_ABLATIONS], keys)
-        for until in (_until(keys.minutes or "2.5"), _until(steps=keys.steps or "600"))
-    )
-    then = [_ablation_page(keys)]
+    untils = _until(keys.minutes or "2.5"), _until(steps=keys.steps or "600")
+    each = [_counterparts("ablations", [*common, *until, *OF_ABLATIONS], keys) for until in untils]
+    job = Job([first + second for first, second in zip(*each)], [_ablation_page(keys)], int(keys.jobs))
     if keys.small:  # without the scene that costs most; the two lanes take about as long
-        lanes = [
-            [sweep for lane in lanes for sweep in lane if ROOM[0] not in sweep]
-            for lanes in (by_minutes, by_steps)
-        ]
-        return Job(lanes, then, int(keys.jobs), small=("0.02", "8", "5"))
-    lanes = [first + second for first, second in zip(by_minutes, by_steps, strict=True)]
-    return Job(lanes, then, int(keys.jobs))
+        job.lanes = [[sweep for sweep in chain(*lanes) if ROOM[0] not in sweep] for lanes in each]
+        job.small = ("0.02", "8", "5")
+    return job
 
 
 def _at_rest(keys: Keys) -> Job:
@@ -273,7 +271,7 @@ def _at_rest(keys: Keys) -> Job:
     base += [f"paths.scenes={keys.data}"] if keys.data else []
     base += [f"views={keys.views}"] if keys.views else []
     seeds = keys.seeds or "2"
-    drawn = words(seeds) if "," in seeds else [str(seed) for seed in range(int(seeds))]
+    drawn = words(seeds) if "," in seeds else range(int(seeds))
     lanes = [[[*base, f"seed={seed}"]] for seed in drawn]
     return Job(lanes, [_ablation_page(keys)], int(keys.jobs))
 
@@ -287,10 +285,7 @@ def _compared(keys: Keys, base: Sweep) -> list[Sweep]:
     if keys.changes:
         reference = [*base, "sweeps=accuracy_time", *([f"model={keys.model}"] if keys.model else [])]
         return [reference, [*reference, *shlex.split(keys.changes)]]
-    model = keys.model or "particles"
-    if model not in ("particles", "forward"):
-        raise ValueError(f"model: expected particles or forward, which have a price list, but got {model}")
-    return [[*base, f"sweeps=price_list_{model}"]]
+    return [[*base, f"sweeps=price_list_{keys.of_two()}"]]
 
 
 def accuracy_time(keys: Keys) -> Job:
@@ -314,9 +309,7 @@ def price_list(keys: Keys) -> Job:
 
 def effects(keys: Keys) -> Job:
     """Compare what a scene calls for with the preset, with every effect and with none."""
-    model = keys.model or "particles"
-    if model not in ("particles", "forward"):
-        raise ValueError(f"model: expected particles or forward, whose effects are compared, but got {model}")
+    model = keys.of_two()
     every = "all_effects" + "_particles" * (model == "particles")
     lane = ["sweeps=effects", *keys.drawn("" if keys.data else "2"), f"model={model}"]
     lane += [f"ablation=auto,base,{every},no_effects", f"budget.minutes={keys.minutes or 1}"]
@@ -341,15 +334,8 @@ def _out(keys: Keys) -> list[str]:
     return [f"out={keys.out}"] if keys.out else []
 
 
-KINDS = {
-    "demo": demo,
-    "tables": tables,
-    "ablations": ablations,
-    "accuracy-time": accuracy_time,
-    "price-list": price_list,
-    "effects": effects,
-    "gpu": gpu,
-}
+KINDS = demo, tables, ablations, accuracy_time, price_list, effects, gpu
+KINDS = {kind.__name__.replace("_", "-"): kind for kind in KINDS}
 
 
 def run(job: Job) -> int:
@@ -375,16 +361,13 @@ def _call(name: str, arguments: list[str], prefix: str = "") -> int:
         arguments = ["--multirun", *arguments]
     print(f"{prefix}{shlex.join([f'forewarp-{name}', *arguments])}", flush=True)
     command = [str(Path(sys.executable).with_name(f"forewarp-{name}")), *arguments]
-    if prefix:
-        with subprocess.Popen(command, stdout=-1, stderr=subprocess.STDOUT, text=True) as process:
-            for line in process.stdout:
-                print(f"{prefix}{line}", end="", flush=True)
-        status = process.returncode
-    else:
-        status = subprocess.run(command).returncode
-    if status < 0 or status >= 128:
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT} if prefix else {}
+    with subprocess.Popen(command, text=True, **pipes) as process:
+        for line in process.stdout or ():
+            print(f"{prefix}{line}", end="", flush=True)
+    if process.returncode < 0 or process.returncode >= 128:
         raise KeyboardInterrupt
-    return status
+    return process.returncode
 
 
 def main() -> None:
