@@ -43,9 +43,9 @@ def test_it_writes_what_the_run_has_into_its_folder_and_says_so(forewarp, ok, fi
         (["layer=still"], "layer: expected all or moving or resting, but got still"),
         (["compressed=9"], "compressed: expected false or true, but got 9"),
         (["times=0"], "times: expected a whole number of at least 1, or a list, but got 0"),
-        (["times=[0,2]"], "times: expected numbers in [0, 1], but got [0, 2]"),
-        (["times=[1,0]"], "times: expected each later than the one before, but got [1, 0]"),
-        (["times=[]"], "times: expected numbers in [0, 1], but got []"),
+        (["times=[0,2]"], "each later than the one before, but got [0, 2]"),
+        (["times=[1,0]"], "expected numbers in [0, 1], each later than the one before, but got [1, 0]"),
+        (["times=[]"], "each later than the one before, but got []"),
         (["points=9"], "points: expected an option of format=ply (degree, up, compressed); leave it out"),
         (
             ["format=glb", "times=3"],
