@@ -41,9 +41,8 @@ def pictures_of(walk: WorldWalk, times, cameras, *, samples: int = 2, workers=No
 
 def smeared(picture: np.ndarray, length: int) -> np.ndarray:
     """The mean of ``length`` copies of (H, W, 3), each a pixel further right: a shaken frame."""
-    moved = [
-        np.roll(picture, shift, 1).astype(np.float32) for shift in range(-(length // 2), length - length // 2)
-    ]
+    shifts = range(-(length // 2), length - length // 2)
+    moved = [np.roll(picture, shift, 1).astype(np.float32) for shift in shifts]
     return np.mean(moved, 0).round().astype(np.uint8)
 
 
@@ -52,9 +51,8 @@ def cameras_on_arc(count=12, radius=4.0, degrees=70.0, height=1.2, focal=300.0, 
     rng, made = np.random.default_rng(1), {}
     for i in range(count):
         angle = math.radians(degrees * (i / (count - 1) - 0.5))
-        center = torch.tensor(
-            [radius * math.sin(angle), -radius * math.cos(angle), height], dtype=torch.float64
-        )
+        place = [radius * math.sin(angle), -radius * math.cos(angle), height]
+        center = torch.tensor(place, dtype=torch.float64)
         up = torch.tensor([roll * rng.normal(), roll * rng.normal(), 1.0])
         pose = look_at(center, torch.zeros(3), up)
         made[f"frame_{i + 1:06d}.jpg"] = Camera(320, 240, focal, focal, 160, 120, pose, 0.0, 0.0, lens=lens)

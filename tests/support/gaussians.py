@@ -23,9 +23,7 @@ def straight(size=(16, 16), **changes):
     return Pinhole(eye, (0.0, 0.0, -4.0), (40.0, 40.0), middle, size, 0.2, **changes)
 
 
-def crowd(
-    count=60, nodes=5, degree=2, color_basis=2, opacity_basis=2, dtype=torch.float64, seed=0, scale=-2.0
-):
+def crowd(count=60, nodes=5, degree=2, color_basis=2, opacity_basis=2, dtype=torch.float64, seed=0, scale=-2):
     """Random particles, how they move, and what a time makes of colour and opacity."""
     generator = torch.Generator().manual_seed(seed)
 
