@@ -302,9 +302,7 @@ def test_a_rig_of_videos_becomes_a_scene_that_is_trained(ok, refused, in_tmp):
     words = ["videos=rig", "out=captures/rig", "threads=1", "lens=SIMPLE_RADIAL"]
     said = refused("capture", *words)
     assert "wall (1): expected a camera that sees what the others see, but got" in said
-    assert (
-        "leave it out (without=['wall (1)']), or go on without it (force=true); what was found stays" in said
-    )
+    assert "leave it out (without=['wall (1)']), or go on without it (force=true); what was found" in said
     done = ok("capture", *words, "without=['wall (1)']")
     lines = done.out.splitlines()
     assert lines[0] == "offsets: by sound"
@@ -334,10 +332,8 @@ def test_a_rig_of_videos_becomes_a_scene_that_is_trained(ok, refused, in_tmp):
 def test_a_capture_written_by_hand_is_fitted(ok, tmp_path):
     world, times = World("lift"), [i / 23 for i in range(24)]
     cameras = [replace(c, near=0.0, far=1.0) for c in random_cameras(24, 32, np.random.default_rng(3))]
-    shots = (
-        PosedShot(f"frame_{i:03d}.png", camera, render(world, time, camera, 1)[0], time)
-        for i, (camera, time) in enumerate(zip(cameras, times))
-    )
+    pictures = (render(world, time, camera, 1)[0] for time, camera in zip(times, cameras))
+    shots = (PosedShot(f"{t:.3f}.png", c, image, t) for t, c, image in zip(times, cameras, pictures))
     write_scene(tmp_path / "data" / "mine", shots, near=2.0, far=6.0, aabb=Box((-1, -1, -1), (1, 1, 1)))
     words = [f"data.root={tmp_path}/data", "data.scene=mine", "trainer=cpu", "logger=none", "seed=0"]
     budget = ["budget.minutes=null", "budget.iterations=300", "callbacks.pictures=null"]
