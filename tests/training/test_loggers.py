@@ -14,12 +14,7 @@ from forewarp.training.loggers import CsvLogger, RunLoggers
 from tests.support.tiny_scene import Interrupt, make_run, stage
 
 STEPS = 6
-PARAMETERS = {
-    "model.name": "forward",
-    "stage.fine.density": 45.0,
-    "preset.rays": "None",
-    "model.rotation": True,
-}
+PARAMETERS = {"model.name": "forward", "stage.fine.density": 45.0, "preset.rays": "None", "model.still": True}
 SCORES = {"test/all/psnr": 30.5}
 
 
