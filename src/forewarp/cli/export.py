@@ -34,16 +34,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from forewarp.cli.entry import command
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from forewarp.export.tracks import Source
-    from forewarp.training.module import DynamicSceneModule
-    from forewarp.training.stages import Run
 
 
 def export(config) -> None:
@@ -90,8 +82,8 @@ def saved_runs(config) -> list:
     return windows
 
 
-def source_of(run: Run, module: DynamicSceneModule, model: str, times: Sequence[float]) -> Source:
-    """Return what exports begin with: a fitted ``module`` of a run, a ``model`` by its config, at times."""
+def source_of(run, module, model: str, times: list[float]):
+    """Return the ``Source`` of exports: a fitted ``module`` of a run, a ``model`` by its config, at times."""
     from forewarp.export.tracks import Source
 
     scene = run.datamodule.scene

@@ -163,10 +163,8 @@ def refuse_missing_start(config: DictConfig) -> None:
     if not str(config.model.get("_target_")).startswith(PARTICLES):
         raise ValueError(f"start: expected model=particles beside it, but got model={config.model.name}")
     if not any(Path(config.run).glob("*/last.ckpt")) and not any(Path(start).glob("*/done.json")):
-        raise ValueError(
-            f"start: expected a finished run of what stands still, but got none in {start}; make it by the "
-            "same command with windows=still, without data.window and start"
-        )
+        advice = "make it by the same command with windows=still, without data.window and start"
+        raise ValueError(f"start: expected a finished run of what stands still, but got none in {start}; {advice}")
 
 
 def refuse_seeds(config: DictConfig) -> None:
@@ -179,10 +177,9 @@ def refuse_seeds(config: DictConfig) -> None:
         if config.get("seeds", 1) != 1:
             raise ValueError(f"seeds: expected 1 in a search, but got {config.seeds}; use seed=N")
         if seeds.startswith("range"):
-            raise ValueError(
-                "hydra.sweeper.params.seed: expected one seed, as this sweeper would search among several, "
-                f"but got {seeds}; add hydra.sweeper.params.seed=0"
-            )
+            expected = "expected one seed, as this sweeper would search among several"
+            advice = "add hydra.sweeper.params.seed=0"
+            raise ValueError(f"hydra.sweeper.params.seed: {expected}, but got {seeds}; {advice}")
 
 
 def refuse_other_methods(config: DictConfig) -> None:
@@ -229,9 +226,7 @@ def viewer_of(config: DictConfig) -> dict | None:
     from forewarp.viewer.server import check_address
 
     if is_swept() and port != 0 and "BasicLauncher" not in str(HydraConfig.get().launcher.get("_target_")):
-        raise ValueError(
-            f"port: expected 0 where jobs may run at once, so that each takes one that is free, but got "
-            f"{port}; set port=0, or launcher=local"
-        )
+        expected = "port: expected 0 where jobs may run at once, so that each takes one that is free"
+        raise ValueError(f"{expected}, but got {port}; set port=0, or launcher=local")
     check_address(config.host, port)
     return {"host": config.host, "port": port}

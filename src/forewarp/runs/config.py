@@ -397,16 +397,26 @@ def check_target(name: object, where: Path | str, key: str, trust: Sequence[str]
     if parts[0] != "forewarp":
         _check_foreign(name, refusal, trust)
         return
-    module, _, last = name.rpartition(".")
-    try:
-        found = getattr(importlib.import_module(module), last)
-    except Exception as error:  # an import may raise anything
-        raise ValueError(f"{refusal} ({type(error).__name__})") from None
+    found = _imported(parts, refusal)
     # A module's own imports do not count: ``forewarp.cli.entry.Path`` is not a class of forewarp.
-    if not inspect.isclass(found) or found.__module__ != module:
+    if not inspect.isclass(found) or found.__module__ != name.rpartition(".")[0]:
         raise ValueError(refusal)
     if not name.startswith(home):
         raise ValueError(f"{refusal}, which is none for this key")
+
+
+def _imported(parts: Sequence[str], refusal: str) -> object:
+    """Import what a name names, first modules, then attributes."""
+    try:
+        found = importlib.import_module(parts[0])
+        for i, part in enumerate(parts[1:], 2):
+            if not hasattr(found, part) and inspect.ismodule(found):
+                importlib.import_module(".".join(parts[:i]))
+            found = getattr(found, part)
+        return found
+    except Exception as error:  # an import may raise anything
+        reason = str(error).partition("\n")[0] or type(error).__name__
+        raise ValueError(f"{refusal}, which cannot be imported ({reason:.120})") from None
 
 
 def _check_foreign(name: str, refusal: str, trust: Sequence[str]) -> None:
@@ -416,15 +426,7 @@ def _check_foreign(name: str, refusal: str, trust: Sequence[str]) -> None:
     parts = name.split(".")
     if any(part.startswith("__") for part in parts):
         raise ValueError(refusal)
-    try:
-        found = importlib.import_module(parts[0])
-        for i, part in enumerate(parts[1:], 2):  # first modules, then attributes
-            if not hasattr(found, part) and inspect.ismodule(found):
-                importlib.import_module(".".join(parts[:i]))
-            found = getattr(found, part)
-    except Exception as error:  # an import may raise anything
-        reason = str(error).partition("\n")[0] or type(error).__name__
-        raise ValueError(f"{refusal}, which cannot be imported ({reason:.120})") from None
+    found = _imported(parts, refusal)
     # A module's own imports do not count, or ``theirs.module.subprocess.run`` would be allowed.
     home = getattr(found, "__module__", None)
     if not callable(found) or not isinstance(home, str):

@@ -302,9 +302,8 @@ def measure_run(run: Run, module: DynamicSceneModule, config: DictConfig) -> dic
 
 def log_scores(run: Run, metrics: dict) -> None:
     """Log the scores of ``metrics.json`` to the run's loggers, as ``test/space/psnr``."""
-    scores = {
-        f"test/{split}/{name}": score for split, of in metrics["test"].items() for name, score in of.items()
-    }
+    rows = ((split, *row) for split, of in metrics["test"].items() for row in of.items())
+    scores = {f"test/{split}/{name}": score for split, name, score in rows}
     scores |= {"test/seconds": sum(metrics["seconds"].values())}
     run.loggers.log_scores(scores, sum(done["steps"] for done in run.finished().values()))
 

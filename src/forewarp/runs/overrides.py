@@ -65,12 +65,9 @@ def bare(override: str) -> str:
     >>> bare(r"run=runs/$\{data.scene\}"), bare(r"data.scene='it\'s'"), bare("seed=1")
     ('run=runs/${data.scene}', "data.scene=it's", 'seed=1')
     """
-    from hydra.core.override_parser.overrides_parser import OverridesParser
-
-    if not TEXTS.fullmatch(key_of(override)):
-        return override
-    value = OverridesParser.create().parse_override(override).value()
-    return f"{key_of(override)}={value}" if isinstance(value, str) else override
+    read = parsed(override) if TEXTS.fullmatch(key_of(override)) else None
+    is_text = read is not None and isinstance(read.value(), str)
+    return f"{key_of(override)}={read.value()}" if is_text else override
 
 
 def as_text(arguments: Sequence[str]) -> list[str]:
@@ -100,14 +97,20 @@ def as_text(arguments: Sequence[str]) -> list[str]:
     return [quoted(argument) for argument in arguments]
 
 
-def is_sweep(override: str) -> bool:
-    """Tell whether Hydra takes an override for several values, as ``data.scene=hook,lego``."""
+def parsed(override: str):
+    """Return an override as Hydra reads it; None where its grammar has no such thing."""
     from hydra.core.override_parser.overrides_parser import OverridesParser
     from hydra.errors import HydraException
 
     with suppress(HydraException):
-        return OverridesParser.create().parse_override(override).is_sweep_override()
-    return False
+        return OverridesParser.create().parse_override(override)
+    return None
+
+
+def is_sweep(override: str) -> bool:
+    """Tell whether Hydra takes an override for several values, as ``data.scene=hook,lego``."""
+    read = parsed(override)
+    return read is not None and read.is_sweep_override()
 
 
 def text_override(key: str, text: str) -> str:
@@ -116,13 +119,9 @@ def text_override(key: str, text: str) -> str:
     >>> text_override("data.scene", "hand"), text_override("data.scene", "2024_11")
     ('data.scene=hand', "data.scene='2024_11'")
     """
-    from hydra.core.override_parser.overrides_parser import OverridesParser
-    from hydra.errors import HydraException
-
-    with suppress(HydraException):  # its grammar may have no such bare value
-        read = OverridesParser.create().parse_override(f"{key}={text}")
-        if not read.is_sweep_override() and read.value() == text:
-            return f"{key}={text}"
+    read = parsed(f"{key}={text}")
+    if read is not None and not read.is_sweep_override() and read.value() == text:
+        return f"{key}={text}"
     # In Hydra's quotes a backslash is one unless a quote follows.
     inner = re.sub(r"(\\+)(?='|$)", r"\1\1", text).replace("'", r"\'")
     return f"{key}='{inner}'"

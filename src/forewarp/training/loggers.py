@@ -83,9 +83,8 @@ class RunLoggers:
         for name, maker in self.makers.items():
             package = _PACKAGES.get(_class_of(maker), "lightning")
             if find_spec(package) is None:
-                raise ImportError(
-                    f"logger: expected {package} for {name}, but got none; install forewarp[trackers]"
-                )
+                expected = f"logger: expected {package} for {name}"
+                raise ImportError(f"{expected}, but got none; install forewarp[trackers]")
 
     def open(self, before: int = 0, step: int = 0) -> list[Logger]:
         """List the open loggers. From now on they log a stage's steps on the axis of the run.
@@ -107,10 +106,9 @@ class RunLoggers:
                 except (OSError, KeyboardInterrupt):
                     raise
                 except Exception as error:  # of the tracker's own kinds
-                    raise ValueError(
-                        f"logger.{name}: expected a tracker that takes this run, but got "
-                        f"{_in_a_line(error)}; mend it, or leave it out of logger=[...]"
-                    ) from error
+                    got = f"{_in_a_line(error)}; mend it, or leave it out of logger=[...]"
+                    expected = f"logger.{name}: expected a tracker that takes this run"
+                    raise ValueError(f"{expected}, but got {got}") from error
             if ids:
                 write_json(self.folder / IDS, ids)
         return list(self._open.values())
@@ -120,18 +118,16 @@ class RunLoggers:
         title = "/".join(self.folder.resolve().parts[-2:])
         if kind in _PACKAGES:
             self.runs.mkdir(parents=True, exist_ok=True)
+        options = {"save_dir": str(self.folder)}
+        if kind is WandbLogger:  # its links may not lie in a run's folder
+            options = {"save_dir": str(self.runs), "name": title, "id": known}
+        elif kind is MLFlowLogger:
+            options = self._store(maker) | {"run_name": title, "run_id": known}
+        elif kind in (TensorBoardLogger, CsvLogger):
+            options |= {"purge_step": step + 1} if kind is TensorBoardLogger else {"first": step}
         # Only one job of a sweep may make the database.
         with FileLock(self.runs / ".mlflow.lock") if kind is MLFlowLogger else nullcontext():
-            if kind is WandbLogger:  # its links may not lie in a run's folder
-                logger = maker(save_dir=str(self.runs), name=title, id=known)
-            elif kind is MLFlowLogger:
-                logger = maker(**self._store(maker), run_name=title, run_id=known)
-            elif kind is TensorBoardLogger:
-                logger = maker(save_dir=str(self.folder), purge_step=step + 1)
-            elif kind is CsvLogger:
-                logger = maker(save_dir=str(self.folder), first=step)
-            else:
-                logger = maker(save_dir=str(self.folder))
+            logger = maker(**options)
             _ = logger.experiment  # connects
         if kind in _PACKAGES:
             ids[name] = str(logger.version)
@@ -164,10 +160,8 @@ class RunLoggers:
             call()
         except Exception as error:  # of the tracker's own kinds
             self._failed.add(name)
-            print(
-                f"warning: logger.{name} failed and is left out from now on: {_in_a_line(error)}",
-                file=sys.stderr,
-            )
+            told = f"warning: logger.{name} failed and is left out from now on"
+            print(f"{told}: {_in_a_line(error)}", file=sys.stderr)
 
     def log(self, scalars: Mapping[str, float], step: int) -> None:
         """Log scalars of a step of the stage that ``open`` has begun.

@@ -22,14 +22,7 @@ from forewarp.files import read_json, write_json
 from forewarp.methods.method import Model, Start, parameter_count
 from forewarp.scene.cloud import Handover
 from forewarp.scene.frame import Scene, instants_of
-from forewarp.training.checkpoints import (
-    KeepCheckpoint,
-    check_state,
-    load_handover,
-    load_weights,
-    make_handover,
-    save_handover,
-)
+from forewarp.training import checkpoints
 from forewarp.training.loggers import RunLoggers
 from forewarp.training.module import DynamicSceneModule
 from forewarp.training.schedule import Curriculum, Stage
@@ -130,12 +123,12 @@ class Run:
                 module = self._module(stage, module, handover, blank=blank)
             module.clock = Clock(self.clock) if blank else clock
             if done:
-                load_weights(module, folder / "last.ckpt")
+                checkpoints.load_weights(module, folder / "last.ckpt")
                 self.tell(f"{stage.settings.name}: finished before")
             else:
                 self._fit_stage(stage, module, handover, steps)
             steps += int(_done(folder)["steps"])
-            handover = load_handover(folder)
+            handover = checkpoints.load_handover(folder)
         return module
 
     def _check_ahead(self, stages: Sequence[Stage]) -> None:
@@ -158,9 +151,9 @@ class Run:
                 expected = f"{self.stage_folder(stage)}: expected a finished stage"
                 raise ValueError(f"{expected}, but got none; continue with forewarp-train")
         *before, last = self.stages
-        handover = load_handover(self.stage_folder(before[-1])) if before else None
+        handover = checkpoints.load_handover(self.stage_folder(before[-1])) if before else None
         module = self._module(last, handover=handover, blank=True)
-        load_weights(module, self.stage_folder(last) / "last.ckpt")
+        checkpoints.load_weights(module, self.stage_folder(last) / "last.ckpt")
         return module
 
     def stage_folder(self, stage: Stage) -> Path:
@@ -171,7 +164,7 @@ class Run:
         """Return whether a stage was trained to its end and has written all its files."""
         folder = self.stage_folder(stage)
         try:
-            load_handover(folder)
+            checkpoints.load_handover(folder)
         except ValueError:
             return False
         return _done(folder) is not None and (folder / "last.ckpt").is_file()
@@ -222,10 +215,10 @@ class Run:
         settings, folder = stage.settings, self.stage_folder(stage)
         last = folder / "last.ckpt"
         sentinel = Sentinel(folder, skip=self.skip)
-        keeper = KeepCheckpoint(last, self.checkpoint_seconds, sentinel.check)
+        keeper = checkpoints.KeepCheckpoint(last, self.checkpoint_seconds, sentinel.check)
         checkpoint, steps = last if last.is_file() else None, 0
         if checkpoint is not None:
-            steps, seconds = check_state(checkpoint, module)
+            steps, seconds = checkpoints.check_state(checkpoint, module)
             fraction = module.settings.fraction(steps, seconds)
             self.tell(f"{settings.name}: goes on at {fraction:.0%}, step {steps}")
         loggers, module.trackers = self.loggers.open(steps_before, steps), self.loggers
@@ -248,7 +241,8 @@ class Run:
             more = f"for all, set a larger budget, or stage.{name}.curriculum.iterations_per_time=null"
             self.tell(f"{name}: ended when {in_play} of {count} training images had come in; {more}")
         keeper.save(trainer)
-        save_handover(make_handover(module.method, self.datamodule.scene, before, in_play), folder)
+        handover = checkpoints.make_handover(module.method, self.datamodule.scene, before, in_play)
+        checkpoints.save_handover(handover, folder)
         clock, steps, parameters = module.clock, module.global_step, parameter_count(module.method)
         done = {"seconds": clock.seconds, "clocks": clock.every, "steps": steps, "parameters": parameters}
         done |= {"frames_in_play": in_play, "peak_memory_bytes": peak_memory_bytes()}
