@@ -53,8 +53,8 @@ class Crash(lightning.Callback):
 
 def test_a_continued_run_equals_an_uninterrupted_one_to_the_bit(tmp_path, whole):
     """Ended at a last step, between stages, and before, while and after the lattice grows."""
-    at = ("coarse", 9), ("fine", 3), ("fine", 5), ("fine", 7)
-    for interruption in (Crash(), *(tiny.Interrupt(*place) for place in at)):
+    fine = [tiny.Interrupt("fine", step) for step in (3, 5, 7)]
+    for interruption in (tiny.Interrupt("coarse", 9), Crash(), *fine):
         with pytest.raises(SystemExit):
             run(tmp_path, [interruption]).fit()
     assert tiny.same(run(tmp_path).fit(), whole[1])
@@ -273,7 +273,7 @@ def test_whoever_sees_to_signals_himself_is_left_alone(tmp_path):
     def handler(number, frame):
         pass
 
-    keeper = KeepCheckpoint(tmp_path / "last.ckpt", 60)
+    keeper = KeepCheckpoint(tmp_path / "last.ckpt", 60, print)
     before = signal.signal(signal.SIGINT, handler)
     try:
         with keeper.listening():

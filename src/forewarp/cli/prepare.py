@@ -164,7 +164,8 @@ def refuse_missing_start(config: DictConfig) -> None:
         raise ValueError(f"start: expected model=particles beside it, but got model={config.model.name}")
     if not any(Path(config.run).glob("*/last.ckpt")) and not any(Path(start).glob("*/done.json")):
         advice = "make it by the same command with windows=still, without data.window and start"
-        raise ValueError(f"start: expected a finished run of what stands still, but got none in {start}; {advice}")
+        expected = "start: expected a finished run of what stands still"
+        raise ValueError(f"{expected}, but got none in {start}; {advice}")
 
 
 def refuse_seeds(config: DictConfig) -> None:

@@ -111,6 +111,10 @@ class Keys(SimpleNamespace):
         seeds = self.seeds or default
         return [] if not seeds else [f"seed={seeds}" if "," in seeds else f"seeds={seeds}"]
 
+    def given(self, *names: str) -> Sweep:
+        """Return those of the keys that were typed, as ``key=value``."""
+        return [f"{name}={getattr(self, name)}" for name in names if getattr(self, name)]
+
     def of_two(self) -> str:
         """Return the model, which is one of two.
 
@@ -142,8 +146,7 @@ def plan_of(kind: str, keys: Keys) -> Job:
     if kind not in KINDS:
         raise ValueError(f"expected one of {', '.join(KINDS)}, but got '{kind}'")
     job = KINDS[kind](keys)
-    more = shlex.split(keys.more)
-    more += [f"{name}={getattr(keys, name)}" for name in ("threads", "launcher") if getattr(keys, name)]
+    more = [*shlex.split(keys.more), *keys.given("threads", "launcher")]
     job.lanes = [[merged(sweep, more) for sweep in lane] for lane in job.lanes if lane]
     return _made_small(job) if keys.small else job
 
@@ -203,8 +206,8 @@ def tables(keys: Keys) -> Job:
         raise ValueError(f"scenes: expected scenes=hook,... beside sweeps=methods, but got none; {advice}")
     preset = keys.preset or ("fast" if keys.data else "demo")
     minutes = keys.minutes or ("null" if preset == "faithful" else "5" if keys.data else "1")
-    base = [f"preset={preset}", *_until(minutes, keys.steps), *(keys.drawn("1")), "score=null"]
-    base += [f"views={keys.views}"] if keys.views else []
+    base = [f"preset={preset}", *_until(minutes, keys.steps), *keys.drawn("1"), "score=null"]
+    base += keys.given("views")
     out = keys.out or "runs/paper/results"
     then = [["report", "kind=paper", "runs=runs/paper", f"out={out}", "curves=docs/results"]]
     if not keys.data:
@@ -264,12 +267,11 @@ def ablations(keys: Keys) -> Job:
 def _at_rest(keys: Keys) -> Job:
     """Leave out each part where training has come to rest; a lane for each seed."""
     unused = ("minutes", "methods", "scenes", "sweeps", "model", "changes")
-    if given := [name for name in unused if getattr(keys, name)]:
+    if given := keys.given(*unused):
         raise ValueError(f"{', '.join(given)}: expected none beside preset=compact, but got some")
-    base = ["sweeps=ablation_at_rest", "score=null", "paths.runs=runs/ablations"]
+    base = ["sweeps=ablation_at_rest", "score=null", "paths.runs=runs/ablations", *keys.given("views")]
     base += _until(steps=keys.steps or "1") if keys.steps or keys.small else []
     base += [f"paths.scenes={keys.data}"] if keys.data else []
-    base += [f"views={keys.views}"] if keys.views else []
     seeds = keys.seeds or "2"
     drawn = words(seeds) if "," in seeds else range(int(seeds))
     lanes = [[[*base, f"seed={seed}"]] for seed in drawn]
@@ -283,7 +285,7 @@ def _ablation_page(keys: Keys) -> list[str]:
 def _compared(keys: Keys, base: Sweep) -> list[Sweep]:
     """All changes of the method's price list; with ``changes`` the reference, then these."""
     if keys.changes:
-        reference = [*base, "sweeps=accuracy_time", *([f"model={keys.model}"] if keys.model else [])]
+        reference = [*base, "sweeps=accuracy_time", *keys.given("model")]
         return [reference, [*reference, *shlex.split(keys.changes)]]
     return [[*base, f"sweeps=price_list_{keys.of_two()}"]]
 
@@ -292,7 +294,7 @@ def accuracy_time(keys: Keys) -> Job:
     """Draw the accuracy of each choice against training time, on one scene."""
     base = [f"budget.minutes={keys.minutes or 3}", *keys.drawn()]
     base += keys.chosen(*words(keys.scenes or "jumpingjacks"))
-    return Job([_compared(keys, base)], [["report", "kind=accuracy_time", *_out(keys)]])
+    return Job([_compared(keys, base)], [["report", "kind=accuracy_time", *keys.given("out")]])
 
 
 def price_list(keys: Keys) -> Job:
@@ -314,7 +316,7 @@ def effects(keys: Keys) -> Job:
     lane = ["sweeps=effects", *keys.drawn("" if keys.data else "2"), f"model={model}"]
     lane += [f"ablation=auto,base,{every},no_effects", f"budget.minutes={keys.minutes or 1}"]
     scenes = keys.chosen(*words(keys.scenes or "bouncingballs hook"))
-    return Job([[[*lane, *scenes]]], [["report", "kind=effects", *_out(keys)]])
+    return Job([[[*lane, *scenes]]], [["report", "kind=effects", *keys.given("out")]])
 
 
 def gpu(keys: Keys) -> Job:
@@ -328,10 +330,6 @@ def gpu(keys: Keys) -> Job:
     pages = ("accuracy_time", "price_list")
     then = [["report", f"kind={kind}", f"runs={folder}", f"out={folder}/results"] for kind in pages]
     return Job([lane], then)
-
-
-def _out(keys: Keys) -> list[str]:
-    return [f"out={keys.out}"] if keys.out else []
 
 
 KINDS = demo, tables, ablations, accuracy_time, price_list, effects, gpu

@@ -39,9 +39,7 @@ class KeepCheckpoint(lightning.Callback):
         asked: whether Ctrl-C was pressed inside ``listening()``.
     """
 
-    def __init__(
-        self, path: Path, seconds: float, check: Callable[[lightning.Trainer], None] = lambda trainer: None
-    ) -> None:
+    def __init__(self, path: Path, seconds: float, check: Callable[[lightning.Trainer], None]) -> None:
         self.path, self.every, self.check = Path(path), seconds, check
         self.asked = False
 

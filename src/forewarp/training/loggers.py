@@ -7,7 +7,7 @@ import os
 import sys
 from collections.abc import Callable, Mapping
 from contextlib import nullcontext
-from functools import cache, partial
+from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -138,7 +138,7 @@ class RunLoggers:
 
         def log_on_the_runs_axis(metrics: Mapping[str, float], step: int | None = None) -> None:
             step = None if step is None else step + self.before
-            self._guard(name, lambda: log_metrics(metrics, step))
+            self._guard(name, log_metrics, metrics, step)
 
         logger.finalize = lambda status: self._guard(name, logger.save)  # Lightning's, after each stage
         logger.log_metrics = log_on_the_runs_axis
@@ -152,12 +152,12 @@ class RunLoggers:
         here = self.runs.resolve()
         return {"tracking_uri": f"sqlite:///{here}/mlflow.db", "artifact_location": f"{here}/mlflow"}
 
-    def _guard(self, name: str, call: Callable[[], None]) -> None:
+    def _guard(self, name: str, call: Callable, *given, **options) -> None:
         """Let a run outlive a tracker that fails: tell it once, and leave it out from then on."""
         if name in self._failed:
             return
         try:
-            call()
+            call(*given, **options)
         except Exception as error:  # of the tracker's own kinds
             self._failed.add(name)
             told = f"warning: logger.{name} failed and is left out from now on"
@@ -177,14 +177,11 @@ class RunLoggers:
         pixels, at = to_bytes(image), step + self.before
         for name, logger in (self._open or {}).items():
             if isinstance(logger, TensorBoardLogger):
-                add = partial(logger.experiment.add_image, title, pixels, at, dataformats="HWC")
+                self._guard(name, logger.experiment.add_image, title, pixels, at, dataformats="HWC")
             elif isinstance(logger, MLFlowLogger):
-                add = partial(logger.experiment.log_image, logger.run_id, pixels, key=title, step=at)
+                self._guard(name, logger.experiment.log_image, logger.run_id, pixels, key=title, step=at)
             elif hasattr(logger, "log_image"):  # Weights & Biases, and loggers made like it
-                add = partial(logger.log_image, title, [pixels], step=step)
-            else:
-                continue
-            self._guard(name, add)
+                self._guard(name, logger.log_image, title, [pixels], step=step)
 
     def log_scores(self, scores: Mapping[str, float], step: int) -> None:
         """Log the scores of a measured run, in TensorBoard beside its hyperparameters (HPARAMS).
@@ -195,8 +192,7 @@ class RunLoggers:
         """
         for name, logger in zip(self.makers, self.open(0, step)):
             if isinstance(logger, TensorBoardLogger):
-                given = dict(self.hyperparameters()), dict(scores), step
-                self._guard(name, partial(logger.log_hyperparams, *given))
+                self._guard(name, logger.log_hyperparams, dict(self.hyperparameters()), dict(scores), step)
             else:
                 logger.log_metrics(dict(scores), step)
             self._guard(name, logger.save)
@@ -207,9 +203,9 @@ class RunLoggers:
     def __exit__(self, kind: type | None, *_) -> None:
         """Close all loggers, as failed after an exception."""
         for (name, logger), close in zip((self._open or {}).items(), self._closing):
-            self._guard(name, partial(close, "success" if kind is None else "failed"))
+            self._guard(name, close, "success" if kind is None else "failed")
             if isinstance(logger, WandbLogger):  # else the next job of a sweep would go on in this run
-                self._guard(name, partial(logger.experiment.finish, exit_code=0 if kind is None else 1))
+                self._guard(name, logger.experiment.finish, exit_code=0 if kind is None else 1)
         self._open, self._closing = None, []
 
 
