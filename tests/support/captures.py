@@ -65,27 +65,19 @@ def sparse_arc(points=400, outliers=0, error=0.5, **options) -> Reconstruction:
     places = np.concatenate([rng.uniform(-1, 1, (points, 3)), 3000 * rng.normal(size=(outliers, 3))])
     grid = np.meshgrid(np.arange(len(cameras)), np.arange(len(places)), indexing="ij")
     seen = np.stack(grid, -1).reshape(-1, 2)
-    return Reconstruction(
-        cameras,
-        places,
-        rng.integers(0, 256, places.shape).astype(np.uint8),
-        np.full(len(places), error),
-        np.full(len(places), len(cameras)),
-        seen,
-        error,
-    )
+    colors = rng.integers(0, 256, places.shape).astype(np.uint8)
+    errors, lengths = np.full(len(places), error), np.full(len(places), len(cameras))
+    return Reconstruction(cameras, places, colors, errors, lengths, seen, error)
 
 
 def write_model(folder, cameras, points, model="OPENCV", lens=(0.0, 0.0, 0.0, 0.0)):
     """Write a COLMAP model as text, by hand: each point is seen by all cameras."""
     folder.mkdir(parents=True)
     one = next(iter(cameras.values()))
-    numbers = {
-        "OPENCV": (one.fx, one.fy, one.cx, one.cy, *lens),
-        "SIMPLE_RADIAL": (one.fx, one.cx, one.cy, lens[0]),
-        "SIMPLE_DIVISION": (one.fx, one.cx, one.cy, lens[0]),
-        "OPENCV_FISHEYE": (one.fx, one.fy, one.cx, one.cy, *lens),
-    }[model]
+    if model.startswith("OPENCV"):
+        numbers = one.fx, one.fy, one.cx, one.cy, *lens
+    else:
+        numbers = one.fx, one.cx, one.cy, lens[0]
     (folder / "cameras.txt").write_text(f"1 {model} {one.width} {one.height} {' '.join(map(str, numbers))}\n")
     lines = []
     for number, (name, camera) in enumerate(cameras.items(), 1):

@@ -78,7 +78,7 @@ def test_minutes_and_iterations_go_by_share():
 def test_what_the_stages_after_one_may_take():
     stages = shared({"a": plan(1), "b": plan(2), "c": plan(1)}, minutes=2.0, iterations=10)
     assert [seconds_after(stages, name) for name in "abc"] == [90, 30, 0]
-    steps = shared({"a": plan(1), "b": plan(999), "c": None}, minutes=None, iterations=10)
+    steps = shared({"a": plan(1), "b": plan(999)}, minutes=None, iterations=10)
     assert [seconds_after(steps, name) for name in "ab"] == [None, 0]
     assert [(s.settings.minutes, s.settings.iterations) for s in steps] == [(None, 1), (None, 10)]
     assert seconds_after(shared({"a": plan(1), "b": plan(1, steps_per_picture=9)}, minutes=2.0), "a") is None

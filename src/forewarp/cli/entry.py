@@ -220,8 +220,6 @@ def choices(conf: Path, name: str) -> str:
         text = (conf / f"{name}.yaml").read_text()
         groups = {group: groups[group] for group in ("dataset", "trainer") if f"- {group}:" in text}
     lines = [f"  {group:<17} {' | '.join(groups[group])}" for group in sorted(groups) if groups[group]]
-    more = [
-        "Every other key: --cfg job prints them all; key=value sets one.",
-        "Where options come from: --info defaults-tree or searchpath. Hydra's own options: --hydra-help.",
-    ]
+    more = ["Every other key: --cfg job prints them all; key=value sets one."]
+    more.append("Where options come from: --info defaults-tree or searchpath. Hydra's own: --hydra-help.")
     return "\n".join((["Choices (group=option):", *lines, ""] if lines else []) + more)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
@@ -44,7 +44,7 @@ def build_run(config: DictConfig) -> Run:
     device = partial(device_for, config)
     data = instantiate(config.data, _convert_="all")
     data.frames_folder = frames_folder(config)
-    plans = {name: stage_of(name, stage) for name, stage in config.stage.items()}
+    plans = {name: stage_of(name, stage) for name, stage in config.stage.items() if stage is not None}
     factories = [make for make in instantiate(config.callbacks, _convert_="all").values() if make is not None]
     trainer = instantiate(config.trainer, _convert_="all")
     name = config.trainer.get("profiler")
@@ -170,10 +170,8 @@ def model_of(config: DictConfig) -> Callable:
     return model
 
 
-def stage_of(name: str, config: DictConfig | None) -> StagePlan | None:
+def stage_of(name: str, config: DictConfig) -> StagePlan:
     """Make a stage, without budget; a stage with a ``model`` has a method of its own."""
-    if config is None:
-        return None
     content = OmegaConf.to_container(config, resolve=True)
     own = content.pop("model", None)
     if "_target_" not in content:
@@ -198,8 +196,8 @@ def check_trainer(trainer: DictConfig) -> None:
         expected = "trainer.precision: expected 32-true or bf16-mixed, as float16 does not hold the gradients"
         raise ValueError(f"{expected}, but got {precision}; use trainer.precision=bf16-mixed")
     devices, nodes = trainer.get("devices", 1), str(trainer.get("num_nodes", 1))
-    listed = isinstance(devices, Sequence) and not isinstance(devices, str)
-    if (len(devices) != 1 if listed else str(devices) != "1") or nodes != "1":
+    count = devices if isinstance(devices, int | str | None) else len(devices)
+    if (str(count), nodes) != ("1", "1"):
         expected = "trainer.devices: expected 1, or the number of one GPU as [0]"
         got = f"{devices}" if nodes == "1" else f"{devices} on {nodes} nodes"
         raise ValueError(f"{expected}, but got {got}; {instead_of('ddp')}")

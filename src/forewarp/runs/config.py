@@ -32,10 +32,8 @@ IDENTITY = ("data", "model", "objective", "stage", "preset", "budget", "seed")
 NOT_OF_RUN = ("cache_bytes", "disk_cache_bytes")  # keys of the data that change no frame
 HASH = "{hash}"
 # May be set beside resume=<run>.
-MAY_CHANGE = (
-    *("trainer", "threads", "lpips_weights", "sheets", "views", "reduce", "evaluate", "checkpoint_seconds"),
-    *("sentinel", "data_changed", "score", "viewer", "host", "port", "logger"),
-)
+MAY_CHANGE = "trainer", "threads", "lpips_weights", "sheets", "views", "reduce", "evaluate", "logger"
+MAY_CHANGE += "checkpoint_seconds", "sentinel", "data_changed", "score", "viewer", "host", "port"
 MOST_LEVELS = 40
 MOST_SEED = 2**31 - 100  # each stage adds its number, and what finds poses takes 31 bits
 TRUST_VARIABLE = "FOREWARP_TRUST"

@@ -11,6 +11,7 @@ import io
 import math
 import signal
 import sys
+import threading
 import zipfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -77,15 +78,14 @@ class KeepCheckpoint(lightning.Callback):
                 says = "\nends this step and saves it; Ctrl-C again stops at once"
                 print(says, file=sys.stderr, flush=True)
 
-        installed = False
-        if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
-            with suppress(ValueError):  # raised in another thread
-                signal.signal(signal.SIGINT, ask)
-                installed = True
+        in_main = threading.current_thread() is threading.main_thread()
+        ours = in_main and signal.getsignal(signal.SIGINT) is signal.default_int_handler
+        if ours:
+            signal.signal(signal.SIGINT, ask)
         try:
             yield
         finally:
-            if installed:  # Lightning may have replaced it
+            if ours:  # Lightning may have replaced it
                 signal.signal(signal.SIGINT, signal.default_int_handler)
 
 

@@ -129,28 +129,27 @@ class StagePlan:
 
 
 def share_out(
-    plans: Mapping[str, StagePlan | None], *, minutes: float | None, iterations: int | None
+    plans: Mapping[str, StagePlan], *, minutes: float | None, iterations: int | None
 ) -> list[Stage]:
     """Divide the run's minutes and iterations among its stages by their shares; keep their order.
 
     Args:
-        plans: by name; None leaves a stage out.
+        plans: by name.
         minutes, iterations: the run's budget; None: unbounded. With both, each stage ends at the first.
 
     Raises:
         ValueError: without any stage, for a share that is not > 0, or for a bound that is not > 0.
     """
-    kept = {name: plan for name, plan in plans.items() if plan is not None}
-    if not kept:
+    if not plans:
         raise ValueError("stage: expected at least one stage, but got none; leave one of them on")
-    for name, plan in kept.items():
+    for name, plan in plans.items():
         wanted = f"a number > 0, or ~stage.{name} to drop it"
         check_number(f"stage.{name}.share", plan.share, wanted, lambda share: share > 0)
     for key, bound in (("minutes", minutes), ("iterations", iterations)):
         if bound is not None:
             check_number(f"budget.{key}", bound, "a number > 0 or null", lambda bound: bound > 0)
-    whole, stages = sum(plan.share for plan in kept.values()), []
-    for name, plan in kept.items():
+    whole, stages = sum(plan.share for plan in plans.values()), []
+    for name, plan in plans.items():
         bounds = {
             "minutes": None if minutes is None else minutes * plan.share / whole,
             "iterations": None if iterations is None else max(1, round(iterations * plan.share / whole)),
