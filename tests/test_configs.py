@@ -26,16 +26,10 @@ PRESETS, MODELS = options("preset"), options("model")
 EXPERIMENTS = options("experiment")
 OF_THE_TABLES = [model for model in MODELS if model not in ("forward", "backward", "particles")]
 IN_SMALL = ("forward", "backward")  # with preset=compact
-OF_PARTICLES = [
-    ("model/motion", "spline"),
-    ("model/motion", "cosines"),
-    ("model/rotation", "nodes"),
-    ("model/view_dependence", "harmonics"),
-    ("model/color_over_time", "cosines"),
-    ("model/opacity_over_time", "cosines"),
-    ("model/exposure", "cosines"),
-    ("model/background", "still"),
-]
+OF_PARTICLES = {"rotation": "nodes", "view_dependence": "harmonics", "color_over_time": "cosines"}
+OF_PARTICLES |= {"opacity_over_time": "cosines", "exposure": "cosines", "background": "still"}
+OF_PARTICLES = [("motion", "spline"), ("motion", "cosines"), *OF_PARTICLES.items()]
+OF_PARTICLES = [(f"model/{effect}", option) for effect, option in OF_PARTICLES]
 OFF = [("inpainter", "unet3d"), ("upsampler", "learned"), ("view_dependence", "mlp"), ("motion", "dct")]
 OFF += [("background", "grid")]
 
@@ -52,10 +46,8 @@ def method_of(model, frames=4):
 
 def rows_of(*chosen):
     """Command lines that choose every option of some groups once, several groups on a line."""
-    columns = [
-        [f"{group}={option}" for option in options(group) if (group, option) not in OF_PARTICLES]
-        for group in chosen
-    ]
+    pairs = ([(group, option) for option in options(group)] for group in chosen)
+    columns = [["=".join(pair) for pair in column if pair not in OF_PARTICLES] for column in pairs]
     return [[word for word in row if word is not None] for row in zip_longest(*columns)]
 
 
@@ -67,9 +59,10 @@ def test_options_of_every_method_compose_and_instantiate(words):
     assert [stage.settings.name for stage in run_of(*words).stages] == ["coarse", "fine"]
 
 
-@pytest.mark.parametrize(
-    "words", rows_of(*(f"model/{effect}" for effect, _ in OFF), "model/radiance"), ids=" ".join
-)
+GROUPS = [f"model/{effect}" for effect, _ in OFF]
+
+
+@pytest.mark.parametrize("words", rows_of(*GROUPS, "model/radiance"), ids=" ".join)
 def test_options_of_voxels_compose_and_instantiate(words):
     model = run_of("model=forward", *words).model
     assert isinstance(method_of(model), torch.nn.Module)
@@ -181,10 +174,9 @@ def test_every_section_of_numbers_composes_and_instantiates(model, preset, exper
 @pytest.mark.slow
 @pytest.mark.parametrize("model", IN_SMALL)
 def test_compact_differs_from_faithful_in_sizes_and_ends_alone(model):
-    faithful, compact = (
-        OmegaConf.to_container(composed("data.scene=x", f"model={model}", f"preset={preset}"), resolve=True)
-        for preset in ("faithful", "compact")
-    )
+    words = "data.scene=x", f"model={model}"
+    both = (composed(*words, f"preset={preset}") for preset in ("faithful", "compact"))
+    faithful, compact = (OmegaConf.to_container(config, resolve=True) for config in both)
     sizes = {"share", "num_voxels", "background_num_voxels", "patches", "curriculum"}
     sizes |= {"start_alpha", "lr_hold", "lr_final_factor"}
     for config in (faithful, compact):

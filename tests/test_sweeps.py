@@ -22,22 +22,11 @@ from tests.support.configs import ROOT, composed
 
 PAPER = {"dnerf": 24, "hypernerf": 12, "nhr": 12, "lego_complete": 9, "ablation_modules": 60}
 PAPER |= {"ablation_losses": 32, "ablation_at_rest": 10, "resolution": 16, "methods": 24}
-OTHERS = {
-    "accuracy_time",
-    "effects",
-    "price_list_forward",
-    "price_list_particles",
-    "search",
-    "search_keys",
-    "minutes",
-}
+OTHERS = {"accuracy_time", "effects", "price_list_forward", "price_list_particles", "search", "search_keys"}
+OTHERS |= {"minutes"}
 COUNTS = {"forward": 45, "particles": 48}
-CHANGES = {
-    name: yaml.safe_load((ROOT / "sweeps" / f"price_list_{name}.yaml").read_text())["hydra"]["sweeper"][
-        "changes"
-    ]
-    for name in COUNTS
-}
+LISTS = {name: (ROOT / "sweeps" / f"price_list_{name}.yaml").read_text() for name in COUNTS}
+CHANGES = {name: yaml.safe_load(text)["hydra"]["sweeper"]["changes"] for name, text in LISTS.items()}
 HOOK = ["experiment=dnerf", "data.scene=hook"]
 
 
@@ -123,19 +112,16 @@ def test_a_typed_scene_takes_the_place_of_those_of_a_sweep(ok, in_tmp):
     ):
         said = ok("train", "--multirun", *words, *typed).out.splitlines()
         skipped = [line for line in said if line.startswith("skipped: ")]
-        assert [line.split("nowhere/")[1] for line in skipped] == [
-            f"{scene}: no such scene" for scene in scenes
-        ]
+        expected = [f"{scene}: no such scene" for scene in scenes]
+        assert [line.split("nowhere/")[1] for line in skipped] == expected
 
 
 @pytest.mark.parametrize("method", CHANGES)
 def test_changes_compose_and_have_folders_of_their_own(method):
     common, changes = ["experiment=dnerf", "data.scene=x"], CHANGES[method][::40]
     found = changed(jobs_of(f"price_list_{method}"), changes)
-    jobs = [
-        job_of(f"price_list_{method}", *common, *(word for part in job for word in shlex.split(part)))
-        for job in found
-    ]
+    words = ([word for part in job for word in shlex.split(part)] for job in found)
+    jobs = [job_of(f"price_list_{method}", *common, *job) for job in words]
     assert len({hashed(job).run for job in jobs}) == len(changes)
     assert {(job.budget.minutes, job.data.held_out) for job in jobs} == {(3, 8)}
     assert jobs[0].model.name == method
@@ -214,10 +200,9 @@ def test_an_ablation_takes_one_thing_from_all():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("preset", "tv_flow"), [("demo", 2.1e-4), ("fast", 1e-3), ("faithful", 1e-3), ("compact", 1e-3)]
-)
-def test_the_whole_method_has_the_papers_weights_and_networks_in_the_fine_stage(preset, tv_flow):
+@pytest.mark.parametrize("preset", ["demo", "fast", "faithful", "compact"])
+def test_the_whole_method_has_the_papers_weights_and_networks_in_the_fine_stage(preset):
+    tv_flow = 2.1e-4 if preset == "demo" else 1e-3
     config = composed(*HOOK, f"preset={preset}", "ablation=full")
     networks = {"upsampler", "inpainter"}
     assert networks.isdisjoint(config.stage.coarse.effects)
@@ -236,9 +221,8 @@ def folder_of(config, **changes):
 
 @pytest.mark.slow
 def test_a_job_is_known_by_what_it_computes():
-    job, other = (
-        composed(f"sweeps=ablation_{sweep}", *HOOK, "ablation=full") for sweep in ("losses", "modules")
-    )
+    sweeps = "losses", "modules"
+    job, other = (composed(f"sweeps=ablation_{sweep}", *HOOK, "ablation=full") for sweep in sweeps)
     same = folder_of(job)
     assert same == folder_of(other)
     assert "{hash}" not in same
@@ -264,10 +248,8 @@ def test_what_stands_alone_begins_as_the_coarse_stage_would():
 
 @pytest.mark.slow
 def test_jobs_of_minutes_have_folders_of_their_own():
-    assert sorted(job[-1] for job in jobs_of("minutes"))[-2:] == [
-        "data.scene=moving-hand",
-        "data.scene=mutant",
-    ]
+    last = sorted(job[-1] for job in jobs_of("minutes"))[-2:]
+    assert last == ["data.scene=moving-hand", "data.scene=mutant"]
     assert len(jobs_of("minutes")) == 7
     changes = [[], ["seed=1"], ["budget.minutes=5"], ["model=forward"], ["stage.fine.density=45"]]
     changes += [["data.root=elsewhere"], ["data.half_resolution=false"]]

@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 
 import torch
 
-KINDS: dict[str, Callable[[], float]] = {
-    "wall": lambda: time.perf_counter(),
-    "processor": lambda: time.process_time(),
-}
+KINDS = {"wall": lambda: time.perf_counter(), "processor": lambda: time.process_time()}
 _left_out = dict.fromkeys(KINDS, 0.0)  # seconds spent inside ``left_out()`` so far
 
 

@@ -26,19 +26,16 @@ def time_text(seconds: float) -> str:
 
 
 @contextmanager
-def told_if_slow(
-    title: str, text: str, *, after: float = 3.0, stream: TextIO | None = None
-) -> Iterator[None]:
+def told_if_slow(title: str, text: str, *, after: float = 3.0) -> Iterator[None]:
     """Print a line, ``title``, 0 % and ``text``, once what is within has taken ``after`` seconds.
 
     Args:
         title: what runs.
         text: what takes the time.
         after: seconds.
-        stream: None: stderr.
     """
     line = f"{title} {0:4.0%} | {text}"
-    timer = threading.Timer(after, print, [line], {"file": stream or sys.stderr, "flush": True})
+    timer = threading.Timer(after, print, [line], {"file": sys.stderr, "flush": True})
     timer.daemon = True
     timer.start()
     try:
@@ -80,25 +77,21 @@ class ProgressLine:
             text: shown at the end.
         """
         remaining = "-:--" if left is None else time_text(left)
-        if self.terminal:
-            self._draw(fraction, f"{fraction:4.0%} | {remaining} left | {text}")
-        else:
-            self._write(f"{self.title} {fraction:4.0%} | {remaining} left | {text}")
+        self._say(fraction, f"{remaining} left | {text}")
         self._next = time.perf_counter() + self.interval
 
     def close(self, fraction: float, text: str) -> None:
         """Write the last line and release the terminal."""
-        if self._bar is not None or self.terminal:
-            self._draw(fraction, f"{fraction:4.0%} | {text}")
+        self._say(fraction, text)
+        if self._bar is not None:
             self._bar.stop()
             self._bar = None
-        else:
-            self._write(f"{self.title} {fraction:4.0%} | {text}")
 
-    def _write(self, line: str) -> None:
-        print(line, file=self.stream, flush=True)
-
-    def _draw(self, fraction: float, text: str) -> None:
+    def _say(self, fraction: float, text: str) -> None:
+        text = f"{fraction:4.0%} | {text}"
+        if not self.terminal:
+            print(f"{self.title} {text}", file=self.stream, flush=True)
+            return
         if self._bar is None:
             # A narrow terminal cuts the text, not the title or the bar.
             columns = (

@@ -29,10 +29,8 @@ def test_a_mode_is_short_without_a_logger_and_in_a_folder_of_its_own(mode, model
     assert config.budget.iterations <= 1000
     assert re.match(rf"runs/debug/x/{mode}-{model}-faithful-seed0-{{hash}}-\d{{4}}-\d{{6}}$", config.run)
     assert config.trainer.get("profiler") == ("simple" if mode == "profile" else None)
-    assert (config.evaluate, config.data.train_views) == (
-        mode in ("fast", "limit"),
-        3 if mode == "overfit" else 16,
-    )
+    assert config.evaluate == (mode in ("fast", "limit"))
+    assert config.data.train_views == (3 if mode == "overfit" else 16)
 
 
 def test_what_is_typed_wins():
@@ -72,21 +70,16 @@ def test_every_mode_works_with_every_family(ok, in_tmp, fitted, model):
         stages = [json.loads(path.read_text()) for path in run.glob("*/done.json")]
         assert 1 <= sum(stage["steps"] for stage in stages) <= 13
         assert not list(run.glob("*/tensorboard"))
-        measured = (
-            json.loads((run / "per_image.json").read_text())["images"] if mode in ("fast", "limit") else []
-        )
+        is_measured = mode in ("fast", "limit")
+        measured = json.loads((run / "per_image.json").read_text())["images"] if is_measured else []
         assert len(measured) == {"fast": 1, "limit": 4}.get(mode, 0)
         tables = [path.read_text() for path in run.glob("*/fit-profile.txt")]
         assert len(tables) == (len(stages) if mode == "profile" else 0)
         assert all("method.look" in table for table in tables)
-    assert re.search(
-        r"^overfit  psnr \d+\.\d\d of 3 training images after 1[23] steps; ", said["overfit"].out, re.M
-    )
+    assert re.search(r"^overfit  psnr \d+\.\d\d of 3 training images after 1[23] ", said["overfit"].out, re.M)
     assert "\nnot overfitted: less than " in said["overfit"].out
     assert "method.look" in said["profile"].out
-    assert re.search(
-        r"^profile  runs/debug/vehicle/profile-.*/fine/fit-profile.txt$", said["profile"].out, re.M
-    )
+    assert re.search(r"^profile  runs/debug/vehicle/profile-.*/fine/fit-profile", said["profile"].out, re.M)
 
 
 @pytest.mark.slow

@@ -79,10 +79,9 @@ def test_data_lie_in_the_checkout_or_in_the_current_folder(forewarp, monkeypatch
 
 
 def test_options_of_ones_own_stand_beside_ours(ok, in_tmp):
-    for group, text in (
-        ("experiment", "defaults:\n  - override /model: backward\n\nseed: 7\n"),
-        ("sweeps", "hydra: {sweeper: {params: {model: 'forward,backward'}}}\n"),
-    ):
+    override = "defaults:\n  - override /model: backward\n\nseed: 7\n"
+    sweep = "hydra: {sweeper: {params: {model: 'forward,backward'}}}\n"
+    for group, text in (("experiment", override), ("sweeps", sweep)):
         (in_tmp / "conf" / group).mkdir(parents=True)
         (in_tmp / "conf" / group / "mine.yaml").write_text(f"# @package _global_\n{text}")
     words = ["--config-dir", "conf", "dataset=mine", "preset=demo", "sweeps=mine", "--cfg", "all"]
@@ -102,23 +101,14 @@ def test_options_of_ones_own_stand_beside_ours(ok, in_tmp):
         (["--experiment", "demo"], "--experiment: expected options without dashes; type experiment=demo"),
         (["modle/view_dependence=sh"], "modle/view_dependence: expected a key of the configuration, but got"),
         (["--multirun", "seed=0,1", "model=forward,backward", "budgt=fast"], "did you mean budget?"),
-        (
-            ["data.scene=sc a,b"],
-            "data.scene: expected one value, but got sc a,b, which reads as several; add",
-        ),
+        (["data.scene=sc a,b"], "data.scene: expected one value, but got sc a,b, which reads as several; "),
         (["data.scene=a,b"], """type a name that has a comma as "data.scene='a,b'\""""),
         (["data=[1"], "data=[1: no viable alternative at input '[1'"),
         (["budget.minutes=-1"], "budget.minutes: expected a number > 0 or null, but got -1"),
         (["model=forward", "+stage.coarse.bogus=1"], "stage.coarse: expected a key of num_voxels,"),
         (["model=forward", "+model.renderer.bogus=1"], "model.renderer: "),
-        (
-            ["--multirun", "hydra/sweeper=one_at_a_time", "hydra.sweeper.changes=[]"],
-            "hydra.sweeper.changes: expected at least one, but got []",
-        ),
-        (
-            ["--multirun", "sweeps=dnerf", "hydra.sweeper.scenes=[]"],
-            "hydra.sweeper.scenes: expected at least",
-        ),
+        (["--multirun", "hydra/sweeper=one_at_a_time", "hydra.sweeper.changes=[]"], "changes: expected at"),
+        (["--multirun", "sweeps=dnerf", "hydra.sweeper.scenes=[]"], "hydra.sweeper.scenes: expected at"),
         (["preset=compact"], "preset: expected demo, fast or faithful, as compact is of model=forward"),
         (["model=tnerf", "ablation=base"], "model: expected forward or backward or particles, which base is"),
         (["model=tnerf", "+stage.coarse.share=1"], "stage.coarse: expected a stage of the method, but got"),
@@ -158,10 +148,8 @@ def test_an_option_that_not_every_job_has_is_named(refused, in_tmp):
 def test_an_option_of_another_method_names_it(refused, in_tmp, arguments, model, owner):
     line = refused("train", *arguments, "paths.data=data")
     option = arguments[0] if arguments[0] in line else arguments[0].partition("=")[0]
-    assert line == (
-        f"{option}: expected an option of model={model}, but got one of model={owner}; add model={owner}, or "
-        "leave it out"
-    )
+    expected = f"expected an option of model={model}, but got one of model={owner}; add model={owner}"
+    assert line == f"{option}: {expected}, or leave it out"
     assert list(in_tmp.iterdir()) == []
 
 
@@ -257,11 +245,8 @@ def test_a_failed_job_of_several_does_not_stop_the_others(forewarp, monkeypatch,
     done = forewarp("train", "seed=0,1", "run=a b/${seed}", "--multirun")
     assert seen == [0, 1]
     assert done.status == 2
-    assert done.err.splitlines() == [
-        "forewarp-train: error: seed: expected another",
-        "forewarp-train: 1 of 2 jobs failed:",
-        "  forewarp-train seed=0 'run=a b/${seed}'",
-    ]
+    lines = "forewarp-train: error: seed: expected another", "forewarp-train: 1 of 2 jobs failed:"
+    assert done.err.splitlines() == [*lines, "  forewarp-train seed=0 'run=a b/${seed}'"]
 
 
 def test_the_notice_of_a_new_experiment_is_silenced(caplog):

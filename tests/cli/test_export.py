@@ -18,9 +18,8 @@ def test_it_writes_what_the_run_has_into_its_folder_and_says_so(forewarp, ok, fi
     text = (run / "config.yaml").read_text()
     assert "eval_background: white" in text
     (run / "config.yaml").write_text(text.replace("eval_background: white", "eval_background: black"))
-    monkeypatch.setattr(
-        formats, "write", lambda kind, source, *a, **k: sources.append(source) or write(kind, source, *a, **k)
-    )
+    noted = lambda kind, source, *a, **k: sources.append(source) or write(kind, source, *a, **k)  # noqa: E731
+    monkeypatch.setattr(formats, "write", noted)
     done, folder = forewarp("export", str(run), "times=[0.25]"), run / "exports" / "ply"
     assert done.out.startswith(f"written: {folder}/frames/frame_0000.ply: 1 file"), done
     assert "ply 100% | 1/1" in done.err
@@ -43,14 +42,11 @@ def test_it_writes_what_the_run_has_into_its_folder_and_says_so(forewarp, ok, fi
         (["layer=still"], "layer: expected all or moving or resting, but got still"),
         (["compressed=9"], "compressed: expected false or true, but got 9"),
         (["times=0"], "times: expected a whole number of at least 1, or a list, but got 0"),
-        (["times=[0,2]"], "times: expected numbers in [0, 1], but got [0, 2]"),
-        (["times=[1,0]"], "times: expected each later than the one before, but got [1, 0]"),
-        (["times=[]"], "times: expected numbers in [0, 1], but got []"),
+        (["times=[0,2]"], "each later than the one before, but got [0, 2]"),
+        (["times=[1,0]"], "expected numbers in [0, 1], each later than the one before, but got [1, 0]"),
+        (["times=[]"], "each later than the one before, but got []"),
         (["points=9"], "points: expected an option of format=ply (degree, up, compressed); leave it out"),
-        (
-            ["format=glb", "times=3"],
-            "times: expected none with format=glb, which holds all times; leave it out",
-        ),
+        (["format=glb", "times=3"], "times: expected none with format=glb, which holds all times; leave it"),
         (["format=glb", "quality=high"], "quality: expected compact or lossless, but got high"),
         (["degree=4"], "degree: expected a whole number from 0 to 3, but got 4"),
         (["format=npz", "points=0"], "points: expected a whole number from 1 to 1000000, but got 0"),

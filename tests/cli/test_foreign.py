@@ -166,9 +166,8 @@ def test_an_interrupted_run_goes_on(forewarp, ok, refused, found, in_tmp):
     config = in_tmp / "run" / "config.yaml"
     saved = yaml.safe_load(config.read_text())
     assert saved["trust"] is None  # a folder has no say in it
-    config.write_text(
-        yaml.safe_dump(saved | {"trust": ["mine"], "callbacks": saved["callbacks"] | {"stop": None}})
-    )
+    saved |= {"trust": ["mine"], "callbacks": saved["callbacks"] | {"stop": None}}
+    config.write_text(yaml.safe_dump(saved))
     forget_mine()
     assert refused("train", "resume=run").endswith(ADVICE)
     assert "mine" not in sys.modules
@@ -179,9 +178,7 @@ def test_an_interrupted_run_goes_on(forewarp, ok, refused, found, in_tmp):
 @pytest.mark.slow
 def test_a_stored_run_is_measured_by_who_trusts_it(ok, refused, sheen, monkeypatch):
     line = refused("evaluate", "run=run")
-    assert line.startswith(
-        "run/config.yaml: data._target_: expected a class of forewarp, but got 'mine.data."
-    )
+    assert line.startswith("run/config.yaml: data._target_: expected a class of forewarp, but got 'mine.")
     assert line.endswith(ADVICE)
     assert "mine" not in sys.modules
     for override in ("trust=mine", "trust=[other,mine]"):
@@ -250,12 +247,8 @@ def test_a_method_is_swept_beside_ours_and_reported(ok, found, in_tmp):
 def test_an_installed_package_is_listed_and_its_options_compose(ok, work):
     """No code of it runs."""
     listed = ok("train", "--help").out
-    for group, option in {
-        "model": "balls",
-        "experiment": "mine",
-        "data": "mine",
-        "callbacks": "speed",
-    }.items():
+    chosen = {"model": "balls", "experiment": "mine", "data": "mine", "callbacks": "speed"}
+    for group, option in chosen.items():
         assert re.search(rf"^  {group} .*\b{option}\b", listed, re.M), group
     words = ["experiment=mine", "model=balls", "data.scene=x", "data.root=y", "--cfg", "job"]
     config = yaml.safe_load(call("train", *words).out)

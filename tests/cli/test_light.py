@@ -30,14 +30,8 @@ REFUSED = [
     (["train", "--unknown"], "--unknown: expected options without dashes; type unknown=VALUE"),
     (["train", "--experiment", "dnerf"], "without dashes; type experiment=dnerf"),
     (["train", "sweeps=nothing"], "Could not find 'sweeps/nothing'"),
-    (
-        ["train", "trainer=mps"],
-        "but got mps; Apple's GPUs have no float64, which cameras and the cosine basis",
-    ),
-    (
-        ["train", "trainer=ddp"],
-        "one process trains a run: use trainer=gpu, and --multirun launcher=joblib",
-    ),
+    (["train", "trainer=mps"], "but got mps; Apple's GPUs have no float64, which cameras and the cosine"),
+    (["train", "trainer=ddp"], "one process trains a run: use trainer=gpu, and --multirun launcher=joblib"),
     (["train", "trainer=tpu"], "trainer: expected auto, cpu or gpu, but got tpu; use trainer=auto"),
     (["train", "data=dnerf"], "data.scene: expected a value, but got none"),
     (["train", *NOWHERE], "data.root: expected an existing folder"),

@@ -21,12 +21,7 @@ def test_tables_without_data_fit_all_methods_on_two_counterparts():
     sweeps, ((*_, out, curves),) = planned("tables")
     assert (out, curves) == ("out=runs/paper/results", "curves=docs/results")
     common = {"preset=demo", "budget.minutes=1", "seeds=1", "threads=1", "budget.clock=processor"}
-    pairs = [
-        ("methods", "dnerf"),
-        ("nhr", "nhr"),
-        ("methods", "hypernerf"),
-        ("lego_complete", "lego_complete"),
-    ]
+    pairs = ("methods", "dnerf"), ("nhr", "nhr"), ("methods", "hypernerf"), ("lego_complete", "lego_complete")
     for sweep, (name, data) in zip(sweeps, pairs, strict=True):
         assert sweep > common | {f"sweeps={name}", f"scene=counterpart_{data}"}
 
@@ -103,11 +98,8 @@ def test_small_runs_are_kept_apart():
         ("ablations PRESET=compact MINUTES=1", "expected none beside preset=compact"),
         ("ablations DATA=there", "forewarp-reproduce tables data=there sweeps=ablations"),
         ("price-list", "data: expected data=<folder"),
-        ("price-list DATA=there MODEL=nerf", "which have a price list, but got nerf"),
-        (
-            "effects MODEL=nerf",
-            "model: expected particles or forward, whose effects are compared, but got nerf",
-        ),
+        ("price-list DATA=there MODEL=nerf", "model: expected particles or forward, but got nerf"),
+        ("effects MODEL=nerf", "model: expected particles or forward, but got nerf"),
     ],
 )
 def test_words_that_would_have_no_effect_are_refused(line, expected):
@@ -136,6 +128,7 @@ def test_make_hands_over_what_was_typed():
 # Scenes as small as they may be, not in the checkout, where the demo would find them.
 TINY = "paths.data=data data.synthesis.size=32 data.synthesis.frames=8 data.synthesis.test_views=[1,1,1] "
 TINY += "data.held_out=2"
+AT_REST = "scene=counterpart_dnerf preset=compact"
 
 
 @pytest.mark.slow
@@ -152,15 +145,9 @@ def test_the_small_form_writes_the_page_by_make(tmp_path):
     ("line", "page"),
     [
         ("gpu DEVICE=cpu", "bench-gpu/results/price-list.md"),
-        (
-            f"effects MODEL=particles SEEDS=1 MORE='scene=specimen_still {TINY}'",
-            "effects/results/effects-particles.md",
-        ),
+        (f"effects SEEDS=1 MORE='scene=specimen_still {TINY}'", "effects/results/effects-particles.md"),
         (f"ablations SEEDS=1 MORE='ablation=full,no_tv {TINY}'", "results/ablation.md"),
-        (
-            f"ablations PRESET=compact SEEDS=1 MORE='scene=counterpart_dnerf preset=compact {TINY}'",
-            "results/ablation.md",
-        ),
+        (f"ablations PRESET=compact SEEDS=1 MORE='{AT_REST} {TINY}'", "results/ablation.md"),
         (f"tables SEEDS=1 METHODS=nerf MORE='{TINY}'", "paper/results/paper.md"),
     ],
 )

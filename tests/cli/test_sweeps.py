@@ -83,10 +83,9 @@ def test_choices_of_particles_are_fitted_and_listed(ok, in_tmp):
 
 @pytest.mark.skipif(bool(find_spec("hydra_plugins.hydra_joblib_launcher")), reason="it is installed")
 def test_a_launcher_that_is_not_installed_says_what_to_install(refused, in_tmp):
-    assert refused("train", "--multirun", "launcher=joblib", "sweeps=dnerf") == (
-        "launcher: expected the package of hydra/launcher=joblib, but got none; "
-        "install forewarp[sweeps], or use launcher=local"
-    )
+    expected = "expected the package of hydra/launcher=joblib, but got none; install forewarp[sweeps]"
+    line = refused("train", "--multirun", "launcher=joblib", "sweeps=dnerf")
+    assert line == f"launcher: {expected}, or use launcher=local"
 
 
 @pytest.fixture

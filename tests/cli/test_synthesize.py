@@ -8,14 +8,7 @@ from hydra.utils import instantiate
 
 from forewarp.data.dnerf import read_scene
 from forewarp.data.files import SceneError
-from forewarp.synth.module import (
-    WRITERS,
-    SyntheticDataModule,
-    SyntheticHyperNeRFDataModule,
-    SyntheticLegoCompleteDataModule,
-    SyntheticNHRDataModule,
-    is_scene,
-)
+from forewarp.synth import module
 from tests.support.configs import composed, options
 
 SMALL = ["size=16", "frames=3", "test_views=[1,1,1]", "val_views=0", "samples_per_pixel=1"]
@@ -55,18 +48,18 @@ def test_runs_that_begin_together_write_a_scene_once(tmp_path, monkeypatch):
         time.sleep(0.3)
         write(folder, **arguments)
 
-    write = WRITERS["dnerf"]
-    monkeypatch.setitem(WRITERS, "dnerf", slow)
+    write = module.WRITERS["dnerf"]
+    monkeypatch.setitem(module.WRITERS, "dnerf", slow)
     with ThreadPoolExecutor(3) as pool:
-        data = [SyntheticDataModule(tmp_path, "s", synthesis=ARGUMENTS, rays=8) for _ in range(3)]
+        data = [module.SyntheticDataModule(tmp_path, "s", synthesis=ARGUMENTS, rays=8) for _ in range(3)]
         list(pool.map(lambda one: one.prepare(), data))
     assert len(written) == 1
-    assert is_scene(tmp_path / "s")
+    assert module.is_scene(tmp_path / "s")
 
 
 def test_every_dataset_has_a_writer_whose_defaults_are_the_configs():
-    assert sorted(WRITERS) == options("dataset")
-    for name, writer in WRITERS.items():
+    assert sorted(module.WRITERS) == options("dataset")
+    for name, writer in module.WRITERS.items():
         config = composed(f"dataset={name}", name="synthesize")
         for key, parameter in inspect.signature(writer).parameters.items():
             if key not in ("folder", "progress"):
@@ -78,7 +71,7 @@ def test_a_folder_of_something_else_is_left_alone(tmp_path):
     (tmp_path / "s").mkdir()
     (tmp_path / "s" / "thesis.txt").write_text("dear")
     with pytest.raises(SceneError, match="expected a synthesised scene or nothing"):
-        SyntheticDataModule(tmp_path, "s", synthesis=ARGUMENTS).setup("fit")
+        module.SyntheticDataModule(tmp_path, "s", synthesis=ARGUMENTS).setup("fit")
     assert (tmp_path / "s" / "thesis.txt").read_text() == "dear"
 
 
@@ -86,7 +79,7 @@ def test_a_folder_of_something_else_is_left_alone(tmp_path):
 @pytest.mark.parametrize("name", [name for name in options("data") if name.startswith("synthetic")])
 def test_synthetic_data_names_arguments_of_its_writer(name, tmp_path):
     data = instantiate(composed(f"data={name}", f"data.root={tmp_path}").data, _convert_="all")
-    assert set(data.synthesis) <= set(inspect.signature(WRITERS[data.dataset]).parameters)
+    assert set(data.synthesis) <= set(inspect.signature(module.WRITERS[data.dataset]).parameters)
 
 
 def test_bad_arguments_leave_nothing(refused, in_tmp):
@@ -106,9 +99,7 @@ def test_bad_arguments_leave_nothing(refused, in_tmp):
         ("iphone", ["size=12", "frames=2"], "dataset.json"),
     ],
 )
-def test_every_dataset_is_written_whole_and_replaced_when_told(
-    forewarp, ok, refused, in_tmp, dataset, keys, marker
-):
+def test_every_dataset_is_written_whole_and_replaced(forewarp, ok, refused, in_tmp, dataset, keys, marker):
     command = ["synthesize", f"dataset={dataset}", "folder=s", "samples_per_pixel=1", *keys]
     done = forewarp(*command)
     assert (done.status, done.out) == (0, "written: s\n")
@@ -126,10 +117,10 @@ LEGO = {"size": 8, "frames": 2, "motions": ["lift", "drive"], "test_views": [1, 
 @pytest.mark.parametrize(
     ("kind", "scene", "synthesis", "counts"),
     [
-        (SyntheticDataModule, "s", ARGUMENTS, (3, 3)),
-        (SyntheticLegoCompleteDataModule, "drive", LEGO, (2, 2 + 3 + 1)),
-        (SyntheticHyperNeRFDataModule, "s", {"size": 16, "frames": 3}, (3, 3)),
-        (SyntheticNHRDataModule, "s", {"size": 24, "frames": 2, "points": 20}, (36, 4)),
+        (module.SyntheticDataModule, "s", ARGUMENTS, (3, 3)),
+        (module.SyntheticLegoCompleteDataModule, "drive", LEGO, (2, 2 + 3 + 1)),
+        (module.SyntheticHyperNeRFDataModule, "s", {"size": 16, "frames": 3}, (3, 3)),
+        (module.SyntheticNHRDataModule, "s", {"size": 24, "frames": 2, "points": 20}, (36, 4)),
     ],
 )
 def test_every_dataset_is_synthesised_at_first_use(tmp_path, capsys, kind, scene, synthesis, counts):

@@ -51,8 +51,6 @@ def test_it_says_where_the_page_is_and_ends_with_ctrl_c(ok, fitted):
         ([], "run: expected the folder of a run, but got nothing; set run=runs/..."),
         (["run2=nowhere", "run={run}"], "expected the configuration of a run, but got none; set run2="),
         (["size=3", "run={run}"], "size: expected a whole number of at least 16, but got 3"),
-        (["points=none", "run={run}"], "points: expected a whole number of at least 1, but got none"),
-        (["tail=2", "run={run}"], "tail: expected a number in .0.01, 1., but got 2"),
     ],
 )
 def test_mistakes_end_before_anything_is_loaded(fitted, words, says):
@@ -81,12 +79,10 @@ def test_two_runs_of_different_scenes_are_refused():
             refuse_other_scene(scene, replace(scene, **changes))
 
 
-@pytest.mark.parametrize(
-    ("command", "words"), [("view", ["run={run}"]), ("train", ["resume={run}", "viewer=true"])]
-)
-def test_without_the_extra_it_says_what_to_install(refused, fitted, monkeypatch, command, words):
+@pytest.mark.parametrize("words", [["view", "run={run}"], ["train", "resume={run}", "viewer=true"]])
+def test_without_the_extra_it_says_what_to_install(refused, fitted, monkeypatch, words):
     monkeypatch.setitem(sys.modules, "viser", None)
-    said = refused(command, *(word.format(run=fitted) for word in words))
+    said = refused(*(word.format(run=fitted) for word in words))
     assert said == "viewer: expected viser, but got none; install forewarp[viewer]"
 
 
@@ -95,10 +91,9 @@ def test_training_with_a_page_asks_for_its_port_before_anything_else(refused, in
     assert says.startswith(f"port: expected a free port, but got {taken}")
 
 
-@pytest.mark.parametrize(
-    ("launcher", "port", "fails"), [("Joblib", 8080, True), ("Joblib", 0, False), ("Basic", 8080, False)]
-)
-def test_jobs_that_run_at_once_take_ports_of_their_own(monkeypatch, launcher, port, fails):
+@pytest.mark.parametrize(("launcher", "port"), [("Joblib", 8080), ("Joblib", 0), ("Basic", 8080)])
+def test_jobs_that_run_at_once_take_ports_of_their_own(monkeypatch, launcher, port):
+    fails = launcher == "Joblib" and port != 0
     seen = OmegaConf.create({"launcher": {"_target_": f"hydra.{launcher}Launcher"}})
     monkeypatch.setattr(HydraConfig, "initialized", lambda: True)
     monkeypatch.setattr(HydraConfig, "get", lambda: SimpleNamespace(mode=RunMode.MULTIRUN, **seen))

@@ -74,13 +74,9 @@ def test_a_logger_stays_in_the_folder_of_its_run(key):
 
 PLAIN = "a: expected a plain value, but got"
 ODD = [
-    *(
-        (f"a: {text!r}", PLAIN)
-        for text in ("${oc.env:HOME}", "x${a}", "${oc.create:{a: 1}}", "${oc.decode:1}")
-    ),
+    *((f"a: {text!r}", PLAIN) for text in ("${oc.env:HOME}", "x${a}", "${oc.create:{a: 1}}", "${oc.dec:1}")),
     ("a: &x [1]\nb: *x", "expected no aliases, but got"),
     ("a: " + "[" * 60 + "]" * 60, "expected at most 40 levels"),
-    ("a: " + "x" * MOST_CONFIG, f"expected at most {MOST_CONFIG} characters"),
     ("a: !!python/object/apply:os.system [false]", "expected YAML"),
     ("- 1", "expected a mapping"),
     *((f"a: {{{name}: [1]}}", f"{name}: expected no key of this name") for name in ("_args", "_args_")),
@@ -97,13 +93,10 @@ def test_what_is_no_plain_config_is_refused_in_one_line(text, said, trust):
     assert str(refusal.value).startswith("config.yaml: ")
 
 
-@pytest.mark.parametrize(
-    "words",
-    [
-        ["experiment=demo_hypernerf"],
-        ["experiment=video_with_poses", "data.scene=x", "model=forward", "model/motion=dct_features"],
-    ],
-)
+FROM_VIDEO = ["experiment=video_with_poses", "data.scene=x", "model=forward", "model/motion=dct_features"]
+
+
+@pytest.mark.parametrize("words", [["experiment=demo_hypernerf"], FROM_VIDEO])
 def test_what_we_write_ourselves_is_trusted(words):
     text = OmegaConf.to_yaml(OmegaConf.create(OmegaConf.to_container(composed(*words), resolve=True)))
     assert read(text) == OmegaConf.create(text)
@@ -148,10 +141,8 @@ def test_a_value_that_would_be_noticed_late_is_refused_at_once(key, value):
         check_values(config)
 
 
-NAMES = [
-    *("{a}", "null", "a=b", "~x", "-x", "[a]", "[a", "{", "'", "a'b", "a\\", "$x"),
-    *("true", "1e3", "007", "(1)", " a "),
-]
+NAMES = ["{a}", "null", "a=b", "~x", "-x", "[a]", "[a", "{", "'", "a'b", "a\\", "$x", "1e3", "007", "(1)"]
+NAMES += [" a ", "true"]
 
 
 def test_odd_names_are_taken_as_typed():

@@ -46,10 +46,8 @@ def test_a_folder_brings_a_method_and_its_numbers(folder):
         return composed(f"hydra.searchpath=[file://{folder}]", "model=mine", "data.scene=x", *words)
 
     plain = mine()
-    assert (plain.model, plain.run) == (
-        {"name": "mine", "_target_": "mine.Method", "width": 32},
-        "runs/x/mine-fast-seed0",
-    )
+    assert plain.model == {"name": "mine", "_target_": "mine.Method", "width": 32}
+    assert plain.run == "runs/x/mine-fast-seed0"
     assert (plain.stage, "objective" in plain, plain.data.rays) == ({"only": {"share": 1.0}}, False, 7)
     assert mine("experiment=dnerf").model.width == 48
     assert mine("scene=specimen_still", "preset=fast").model.width == 64

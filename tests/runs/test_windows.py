@@ -43,11 +43,7 @@ def test_what_cannot_be_is_refused_in_a_line(words, line):
 
 
 def test_scores_are_means_over_the_test_views_of_all_windows(tmp_path):
-    for name, window, values in (
-        ("b", [0.5, 1.0], [20.0]),
-        ("a", [0.0, 0.5], [30.0, 31.0]),
-        ("c", None, [9]),
-    ):
+    for name, window, values in (("b", [0.5, 1], [20.0]), ("a", [0, 0.5], [30.0, 31.0]), ("c", None, [9])):
         write_json(tmp_path / name / "metrics.json", {"protocol": {"window": window} if window else {}})
         views = [{"scores": {"psnr": value}} for value in values]
         write_json(tmp_path / name / "per_image.json", {"images": views})

@@ -59,12 +59,8 @@ def compositing_cases() -> Iterator[Case]:
     """Yield cases from density to picture."""
     for name, raw in (("-60", -60.0), ("-10: empty space", -10.0), ("0", 0.0), ("30", 30.0), ("1e30", 1e30)):
         inputs = [raw + uniform(0, 50)]
-        yield (
-            "Activation.alpha",
-            f"raw density {name}",
-            lambda r: Activation(-4.6, 0.03).alpha(r, 0.03),
-            inputs,
-        )
+        opacity = lambda r: Activation(-4.6, 0.03).alpha(r, 0.03)  # noqa: E731
+        yield "Activation.alpha", f"raw density {name}", opacity, inputs
     ids = torch.arange(64).repeat_interleave(50)
     for name, power in (("1e-12", -12), ("1e-3", -3), ("1", 0), ("1e4", 4), ("1e30", 30)):
         inputs = [uniform(1, 3200) * 10.0**power]
@@ -88,12 +84,8 @@ def splat_cases() -> Iterator[Case]:
     lattice = torch.cartesian_prod(*(torch.arange(float(n)) for n in SHAPE)).double()
     source = uniform(5, len(lattice), 3, low=-5, high=5)
     yield "average_splat", "zero flow", splat(SHAPE), [source, lattice]
-    yield (
-        "average_splat",
-        "threefold expansion",
-        splat((27, 24, 21)),
-        [source, 3.07 * lattice.float().double()],
-    )
+    apart = 3.07 * lattice.float().double()
+    yield "average_splat", "threefold expansion", splat((27, 24, 21)), [source, apart]
     for sliver in (1e-2, 1e-6):
         at = (lattice + torch.tensor([1 - sliver, 0.5, 0.25])).float().double()
         yield "average_splat", f"coverage {sliver:g}", splat(SHAPE), [source, at]
@@ -105,20 +97,16 @@ def splat_cases() -> Iterator[Case]:
 
 def lattice_cases() -> Iterator[Case]:
     """Yield cases of trilinear reads, variation and marching."""
-    for name, shape, low, high in (
-        ("random places", SHAPE, 0.0, 6.0),
-        ("far end of 256 voxels", (256, 256, 256), 250.0, 255.0),
-        ("outside the box", SHAPE, 1e3, 1e6),
-    ):
+    far = "far end of 256 voxels", (256, 256, 256), 250.0, 255.0
+    places = ("random places", SHAPE, 0.0, 6.0), far, ("outside the box", SHAPE, 1e3, 1e6)
+    for name, shape, low, high in places:
         index = torch.full(shape, -1, dtype=torch.int32)
         index[-6:, -6:, -6:] = torch.arange(216, dtype=torch.int32).reshape(6, 6, 6)
         inputs = [uniform(9, 216, 4, low=-5, high=5), uniform(10, 500, 3, low=low, high=high)]
         yield "trilinear", name, lambda v, p, i=index: trilinear(v, i, p, v.new_full((4,), -1.0)), inputs
     pairs = neighbour_pairs(torch.arange(504, dtype=torch.int32).reshape(SHAPE))
-    for name, values in (
-        ("noise of 1e-6 on 10", 10 + 1e-6 * uniform(11, 504, 1)),
-        ("1e4", 1e4 * uniform(11, 504, 1)),
-    ):
+    noise = uniform(11, 504, 1)
+    for name, values in (("noise of 1e-6 on 10", 10 + 1e-6 * noise), ("1e4", 1e4 * noise)):
         yield "total_variation", name, lambda v: total_variation(v, pairs), [values.float().double()]
     depth = (0.5 + 1e-4 * uniform(12, 16, 8, 8)).float().double()
     opacity = uniform(13, 16, 8, 8)
@@ -137,10 +125,8 @@ def lattice_cases() -> Iterator[Case]:
 
 def encoding_cases() -> Iterator[Case]:
     """Yield cases of encoded times and positions."""
-    for name, times in (
-        ("all times", uniform(16, 200)),
-        ("1e-6 beside the canonical", 0.5 + 1e-6 * uniform(17, 200)),
-    ):
+    beside = 0.5 + 1e-6 * uniform(17, 200)
+    for name, times in (("all times", uniform(16, 200)), ("1e-6 beside the canonical", beside)):
         inputs = [times.float().double()]
         yield "dct_basis", f"49 cosines, {name}", lambda t: dct_basis(t, 49, 50, 0.5, 0.2), inputs
     inputs = [uniform(18, 200, 3, low=-1, high=1)]
@@ -167,9 +153,8 @@ def changed(camera: Pinhole | None = None, moving: bool = True, **changes) -> Ha
     particles, warp, *bases = crowd(dtype=torch.float32)
     particles = particles._replace(**{n: change(getattr(particles, n)) for n, change in changes.items()})
     warp = warp if moving else still(particles)
-    return Hard(
-        *_as((particles, warp), torch.float64), camera or pinhole(), *(basis.double() for basis in bases)
-    )
+    bases = [basis.double() for basis in bases]
+    return Hard(*_as((particles, warp), torch.float64), camera or pinhole(), *bases)
 
 
 def _as(groups: tuple, kind: torch.dtype, place: torch.device | str = "cpu") -> list:
@@ -288,9 +273,7 @@ def node_cases() -> Iterator[Case]:
     yield "spline_basis", "41 times", lambda t: spline_basis(t.detach(), 22), [uniform(24, 41)]
 
 
-def answers(
-    operator: Callable, inputs: list[Tensor], dtype: torch.dtype
-) -> tuple[list[Tensor], list[Tensor]]:
+def answers(operator: Callable, inputs: list[Tensor], dtype: torch.dtype) -> tuple[list[Tensor], ...]:
     """Return outputs, and gradients of a fixed random weighting of them, both as float64."""
     leaves = [x.to(dtype).requires_grad_() for x in inputs]
     out = operator(*leaves)

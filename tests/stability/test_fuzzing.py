@@ -10,6 +10,7 @@ import shutil
 import zipfile
 from collections import Counter
 from dataclasses import replace
+from itertools import chain
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -31,22 +32,8 @@ from forewarp.runs.config import saved_config
 from forewarp.scene.frame import Scene
 from forewarp.scene.view import Moment, View
 from forewarp.training.checkpoints import check_state, load_weights
+from tests.support import written_scenes as written
 from tests.support.configs import composed
-from tests.support.written_scenes import (
-    LEGO_TRUTH,
-    RIG_TRUTH,
-    dnerf_shots,
-    dome,
-    dome_truth,
-    fixed_cameras,
-    grey,
-    rig,
-    write_dnerf,
-    write_dome,
-    write_multicam,
-    write_rig,
-    write_video,
-)
 
 pytestmark = pytest.mark.stability
 
@@ -61,13 +48,8 @@ NAN_SIGNALLING = np.full((6, 8), 0x7F800001, np.uint32).view(np.float32)
 ARRAYS = [
     *(np.full((6, 8), np.nan, np.float32), NAN_SIGNALLING, NAN_SIGNALLING[:2, :3], np.full((6, 8), 1e300)),
     *(-np.ones((6, 8)), np.zeros((0, 6)), np.zeros((3, 2), np.complex64), np.full((2, 6), np.inf)),
-    *(
-        np.full((2, 3), 1e30),
-        np.full((2, 6), 1e30),
-        np.diag([-1e30] * 6),
-        np.array("x"),
-        np.array([["a"] * 3]),
-    ),
+    *(np.full((2, 3), 1e30), np.full((2, 6), 1e30), np.diag([-1e30] * 6), np.array("x")),
+    np.array([["a"] * 3]),
 ]
 
 
@@ -194,12 +176,10 @@ def harmed(draw, files: dict[Path, bytes]) -> Changes:
     for _ in range(draw(st.sampled_from([1, 1, 2]))):
         path = draw(st.sampled_from(kinds[draw(st.sampled_from(sorted(kinds)))]))
         way = draw(st.sampled_from([*ANY, *WAYS.get(path.suffix, []), "other", "gone"]))
-        if way == "gone":
-            changes[path] = None
-        elif way == "other":
-            changes[path] = files[draw(st.sampled_from(list(files)))]
-        else:
+        if callable(way):
             changes[path] = way(draw, files[path])
+        else:
+            changes[path] = None if way == "gone" else files[draw(st.sampled_from(list(files)))]
     return changes
 
 
@@ -209,37 +189,37 @@ QUICK = settings(FUZZ, max_examples=20, derandomize=True, deadline=60_000)  # ot
 
 
 def three_kinds(folder):
-    test = [s for i, a in enumerate(dnerf.ABILITIES) for s in dnerf_shots(2, i, ability=a, depth=True)]
-    splits, truth = {"train": dnerf_shots(3), "test": test}, LEGO_TRUTH
-    dnerf.write_scene(folder, splits, camera_angle_x=0.7, trajectories=truth)
+    shots = (written.dnerf_shots(2, i, ability=a, depth=True) for i, a in enumerate(dnerf.ABILITIES))
+    splits = {"train": written.dnerf_shots(3), "test": chain(*shots)}
+    dnerf.write_scene(folder, splits, camera_angle_x=0.7, trajectories=written.LEGO_TRUTH)
 
 
 def two_phones(folder):
     points = np.arange(12.0).reshape(4, 3)
-    write_rig(folder, rig(3), points=points, trajectories=RIG_TRUTH)
+    written.write_rig(folder, written.rig(3), points=points, trajectories=written.RIG_TRUTH)
 
 
 def small_dome(folder):
-    cameras = dome(3, sizes=((24, 18), (18, 24)))
-    write_dome(folder, cameras, 2, trajectories=dome_truth(2))
+    cameras = written.dome(3, sizes=((24, 18), (18, 24)))
+    written.write_dome(folder, cameras, 2, trajectories=written.dome_truth(2))
 
 
 def video(folder):
-    write_video(folder, times=[i / 9 for i in range(10)], channels=4)
+    written.write_video(folder, times=[i / 9 for i in range(10)], channels=4)
 
 
 def films(folder):
     """A film, and folders of frames."""
-    cameras = fixed_cameras(3, size=(16, 24))
-    write_multicam(folder, cameras[:1], count=2)
+    cameras = written.fixed_cameras(3, size=(16, 24))
+    written.write_multicam(folder, cameras[:1], count=2)
     for k, camera in enumerate(cameras[1:], 1):
         for n in range(2):
-            write_image(folder / f"cam{k:02d}" / f"{n}.png", grey(camera, n, k))
+            write_image(folder / f"cam{k:02d}" / f"{n}.png", written.grey(camera, n, k))
     multicam.write_poses(folder, cameras, near=14.0, far=30.0)
 
 
 FORMATS = {
-    "dnerf": (write_dnerf, dnerf.read_scene),
+    "dnerf": (written.write_dnerf, dnerf.read_scene),
     "lego_complete": (three_kinds, dnerf.read_lego_complete),
     "hypernerf": (two_phones, hypernerf.read_scene),
     "nhr": (small_dome, nhr.read_scene),
@@ -273,14 +253,8 @@ def check_whole(scene):
 
 def of_run(root):
     """A run's config and its checkpoint, each with what reads it."""
-    small = (
-        "model=forward",
-        "experiment=demo",
-        "stage.coarse.num_voxels=[[0,64]]",
-        "data.root=data",
-        "logger=none",
-    )
-    config = OmegaConf.to_container(composed(*small, "trainer=cpu"), resolve=True)
+    small = ["model=forward", "experiment=demo", "stage.coarse.num_voxels=[[0,64]]", "data.root=data"]
+    config = OmegaConf.to_container(composed(*small, "logger=none", "trainer=cpu"), resolve=True)
     GlobalHydra.instance().clear()
     config["data"]["_target_"] = "forewarp.data.module.DNeRFDataModule"  # whose scene may be absent
     del config["data"]["synthesis"]
@@ -288,7 +262,7 @@ def of_run(root):
     for name in ("config", "checkpoint"):
         (root / name).mkdir()
     (root / "config" / "config.yaml").write_text(OmegaConf.to_yaml(config))
-    write_dnerf(root / "toy")
+    written.write_dnerf(root / "toy")
     scene = dnerf.read_scene(root, "toy")
     run = replace(build_run(config), datamodule=SimpleNamespace(scene=scene))
     module = run._module(run.stages[0], blank=True)
@@ -303,10 +277,8 @@ def of_run(root):
         load_weights(module, file)
         module.render(View(scene.test[0].camera, torch.arange(4)), Moment(0.5), torch.ones(3))
 
-    return {
-        "config": (lambda: saved_config(str(root / "config"), nothing), ValueError),
-        "checkpoint": (render, (ValueError, OSError)),
-    }
+    read_config = lambda: saved_config(str(root / "config"), nothing)  # noqa: E731
+    return {"config": (read_config, ValueError), "checkpoint": (render, (ValueError, OSError))}
 
 
 @pytest.fixture(scope="module")
@@ -318,10 +290,7 @@ def loaders(tmp_path_factory):
         write(root / name)
         found[name] = (lambda read=read, name=name: check_whole(read(root, name)), SceneError)
     found |= of_run(root)
-    return {
-        name: SimpleNamespace(folder=root / name, read=read, refusal=refusal)
-        for name, (read, refusal) in found.items()
-    }
+    return {name: SimpleNamespace(folder=root / name, read=r, refusal=e) for name, (r, e) in found.items()}
 
 
 @pytest.fixture

@@ -10,44 +10,11 @@ import torch
 from torch.autograd import gradcheck
 
 from forewarp import ops
-from forewarp.ops import backend
+from forewarp.ops import backend, gaussians, grid, nodes
 from forewarp.ops.curves import dct_basis
 from forewarp.ops.encode import positional_encoding, spherical_harmonics_1
-from forewarp.ops.gaussians import (
-    Gaussians,
-    Splats,
-    Warp,
-    moved,
-    project,
-    project_reference,
-    rasterize,
-    rasterize_reference,
-    rotations,
-)
-from forewarp.ops.grid import (
-    block_means,
-    block_sums,
-    corner_weights,
-    huber_variation,
-    neighbour_pairs,
-    patch_variation,
-    reduced_depth,
-    second_variation,
-    total_variation,
-    trilinear,
-    trilinear_reference,
-)
 from forewarp.ops.lens import distort, distort_with_jacobian
 from forewarp.ops.march import accumulate, dense_weights, midpoints, render_weights, union
-from forewarp.ops.nodes import (
-    carry_nodes,
-    geman_mcclure,
-    move_by_screw,
-    node_maps,
-    skin_weights,
-    stiffness,
-    stretch,
-)
 from forewarp.ops.splat import average_splat, scatter_reference, with_copies
 from tests.support.gaussians import crowd, pinhole
 from tests.support.hard_cases import index_with
@@ -94,7 +61,7 @@ def ids_of(seed):
     return torch.randint(0, 4, (9,), generator=torch.Generator().manual_seed(seed)).sort().values
 
 
-def of_trilinear(seed, read=trilinear):
+def of_trilinear(seed, read=grid.trilinear):
     shape, index, values = sparse(seed)
     return lambda v, p: read(v, index, p, draw(seed + 2, 2)), values, generic(seed, 5, shape)
 
@@ -113,45 +80,55 @@ def of_copies(seed):
 
 def of_total_variation(seed):
     _, index, values = sparse(seed)
-    return lambda v: total_variation(v, neighbour_pairs(index)), values
+    return lambda v: grid.total_variation(v, grid.neighbour_pairs(index)), values
 
 
-def of_projection(seed, see=project):
+def of_patch_variation(seed):
+    return lambda d: grid.patch_variation(d, draw(seed, 2, 3, 3).sigmoid()), draw(seed + 1, 2, 3, 3)
+
+
+def of_carried(seed):
+    carried = lambda a, b: nodes.carry_nodes(a, b, draw(seed, 4), draw(seed, 3, 3))  # noqa: E731
+    return carried, draw(seed + 1, 3, 4, 3), draw(seed + 2, 3, 4, 3)
+
+
+def of_projection(seed, see=gaussians.project):
     """All that a splat is made of: particles, nodes' maps, shares of nodes."""
     particles, warp, *bases = crowd(count=3, degree=0, seed=seed)
 
     def numbers(*leaves):
-        moving = Warp(leaves[5], warp.links, leaves[6])
-        return see(Gaussians(*leaves[:5]), moving, pinhole(), *bases).values
+        moving = gaussians.Warp(leaves[5], warp.links, leaves[6])
+        return see(gaussians.Gaussians(*leaves[:5]), moving, pinhole(), *bases).values
 
     return numbers, *particles, warp.maps, warp.weights
 
 
-def of_rasterizing(seed, draw=rasterize):
+def of_rasterizing(seed, draw=gaussians.rasterize):
     """Pictures by the numbers of splats."""
     particles, warp, *bases = crowd(4, scale=-1.0, seed=seed)
-    splats = project(particles, warp, pinhole(), *bases)
-    return lambda numbers: draw(Splats(numbers, splats.reach), 3, 4), splats.values
+    splats = gaussians.project(particles, warp, pinhole(), *bases)
+    return lambda numbers: draw(gaussians.Splats(numbers, splats.reach), 3, 4), splats.values
 
 
 def of_stiffness(seed):
     """The strain between nodes by their motion."""
     places, edges = draw(seed, 4, 3), torch.tensor([[1, 2], [2, 3], [3, 0], [0, 1]])
     shares = torch.full((4, 2), 0.5).double()
-    return lambda m: stiffness(m, places, edges, shares), 0.3 * draw(seed + 1, 4, 6)
+    return lambda m: nodes.stiffness(m, places, edges, shares), 0.3 * draw(seed + 1, 4, 6)
 
 
 def of_moved(seed):
     """Where particles go by their means and the nodes' maps."""
     particles, warp, *_ = crowd(count=3, seed=seed)
-    return lambda means, maps: moved(means, Warp(maps, warp.links, warp.weights)), particles.means, warp.maps
+    went = lambda means, maps: gaussians.moved(means, warp._replace(maps=maps))  # noqa: E731
+    return went, particles.means, warp.maps
 
 
 # For each operator: what to differentiate, and the tensors by which to do so.
 CHECKS = {
     "trilinear": of_trilinear,
-    "trilinear_reference": partial(of_trilinear, read=trilinear_reference),
-    "corner_weights": lambda s: (lambda p: corner_weights(p, (3, 4, 5))[1], generic(s, 4, (3, 4, 5))),
+    "trilinear_reference": partial(of_trilinear, read=grid.trilinear_reference),
+    "corner_weights": lambda s: (lambda p: grid.corner_weights(p, (3, 4, 5))[1], generic(s, 4, (3, 4, 5))),
     "average_splat": of_splat,
     "with_copies": of_copies,
     "scatter_reference": partial(of_splat, splat=lambda *a: scatter_reference(*a)[:1]),
@@ -161,37 +138,30 @@ CHECKS = {
     "midpoints": lambda s: (midpoints, draw(s, 3, 4)),
     "union": lambda s: (union, draw(s, 3, 4), draw(s + 1, 3, 2)),
     "total_variation": of_total_variation,
-    "patch_variation": lambda s: (
-        lambda d: patch_variation(d, draw(s, 2, 3, 3).sigmoid()),
-        draw(s + 1, 2, 3, 3),
-    ),
+    "patch_variation": of_patch_variation,
     "dct_basis": lambda s: (lambda t: dct_basis(t, 4, 9, 0.3, 0.2), draw(s, 3).sigmoid()),
-    "block_sums": lambda s: (block_sums, draw(s, 4, 6, 2)),
-    "block_means": lambda s: (lambda x: block_means(x, 2), draw(s, 4, 6, 2)),
-    "reduced_depth": lambda s: (reduced_depth, draw(s, 4, 6).abs() + 0.1),
+    "block_sums": lambda s: (grid.block_sums, draw(s, 4, 6, 2)),
+    "block_means": lambda s: (lambda x: grid.block_means(x, 2), draw(s, 4, 6, 2)),
+    "reduced_depth": lambda s: (grid.reduced_depth, draw(s, 4, 6).abs() + 0.1),
     "positional_encoding": lambda s: (lambda x: positional_encoding(x, 4), draw(s, 3, 2)),
     "distort": lambda s: (lambda p: distort(p, *LENS), draw(s, 4, 2)),
     "distort_with_jacobian": lambda s: (lambda p: distort_with_jacobian(p, *LENS)[1], draw(s, 4, 2)),
     "spherical_harmonics_1": lambda s: (spherical_harmonics_1, draw(s, 3, 3)),
     "project": of_projection,
-    "project_reference": partial(of_projection, see=project_reference),
+    "project_reference": partial(of_projection, see=gaussians.project_reference),
     "rasterize": of_rasterizing,
-    "rasterize_reference": partial(of_rasterizing, draw=rasterize_reference),
+    "rasterize_reference": partial(of_rasterizing, draw=gaussians.rasterize_reference),
     "stiffness": of_stiffness,
-    "skin_weights": lambda s: (partial(skin_weights, draw(s, 5, 3).exp()), draw(s + 1, 5, 3)),
+    "skin_weights": lambda s: (partial(nodes.skin_weights, draw(s, 5, 3).exp()), draw(s + 1, 5, 3)),
     "moved": of_moved,
-    "move_by_screw": lambda s: (move_by_screw, draw(s, 3, 3), draw(s + 1, 3, 3), draw(s + 2, 3, 3)),
-    "second_variation": lambda s: (second_variation, draw(s, 3, 4, 5, 2)),
-    "huber_variation": lambda s: (huber_variation, 2 * draw(s, 3, 4, 5, 2)),
-    "stretch": lambda s: (stretch, torch.eye(3, dtype=torch.float64) + 0.2 * draw(s, 2, 3, 3)),
-    "geman_mcclure": lambda s: (partial(geman_mcclure, scale=0.5), draw(s, 5).square()),
-    "rotations": lambda s: (rotations, draw(s, 3, 4)),
-    "node_maps": lambda s: (lambda m: node_maps(m, draw(s, 3, 3)), draw(s + 1, 3, 6)),
-    "carry_nodes": lambda s: (
-        lambda a, b: carry_nodes(a, b, draw(s, 4), draw(s, 3, 3)),
-        draw(s + 1, 3, 4, 3),
-        draw(s + 2, 3, 4, 3),
-    ),
+    "move_by_screw": lambda s: (nodes.move_by_screw, draw(s, 3, 3), draw(s + 1, 3, 3), draw(s + 2, 3, 3)),
+    "second_variation": lambda s: (grid.second_variation, draw(s, 3, 4, 5, 2)),
+    "huber_variation": lambda s: (grid.huber_variation, 2 * draw(s, 3, 4, 5, 2)),
+    "stretch": lambda s: (nodes.stretch, torch.eye(3, dtype=torch.float64) + 0.2 * draw(s, 2, 3, 3)),
+    "geman_mcclure": lambda s: (partial(nodes.geman_mcclure, scale=0.5), draw(s, 5).square()),
+    "rotations": lambda s: (gaussians.rotations, draw(s, 3, 4)),
+    "node_maps": lambda s: (lambda m: nodes.node_maps(m, draw(s, 3, 3)), draw(s + 1, 3, 6)),
+    "carry_nodes": of_carried,
 }
 
 KERNELS = ("trilinear", "average_splat")

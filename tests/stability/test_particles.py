@@ -15,17 +15,7 @@ from forewarp.methods.particles.model import pinhole_of
 from forewarp.ops import backend
 from forewarp.ops.adam import AdamState, adam_rows
 from forewarp.ops.gaussians import Gaussians, Splats, Warp, project, rasterize
-from tests.stability.report import (
-    SEEN,
-    UNSEEN,
-    Hard,
-    answers,
-    compared,
-    drawn,
-    node_cases,
-    relative_error,
-    rows,
-)
+from tests.stability import report
 from tests.support.gaussians import NO_FADES, NO_TINTS, crowd, one, pinhole, still, straight
 from tests.support.particles import EVERY, FACTORS, module_with, shaken, small_data
 
@@ -44,36 +34,35 @@ def parts(found):
 def check_close(ours, exact, most):
     """Each tensor is within ``most`` of float64, relative to its largest entry."""
     for number, (a, b) in enumerate(zip(ours, exact, strict=True)):
-        assert relative_error([a.cpu().double()], [b.cpu().double()]) <= most, number
+        assert report.relative_error([a.cpu().double()], [b.cpu().double()]) <= most, number
 
 
-@pytest.mark.parametrize("name", SEEN)
+@pytest.mark.parametrize("name", report.SEEN)
 def test_pictures_and_gradients_keep_their_digits(place, name):
     most = COVERED.get(name, 2e-5)
-    function, leaves = drawn(SEEN[name])
-    exact, ours = (
-        answers(function, [t.to(place) for t in leaves], k) for k in (torch.float64, torch.float32)
-    )
+    function, leaves = report.drawn(report.SEEN[name])
+    both = torch.float64, torch.float32
+    exact, ours = (report.answers(function, [t.to(place) for t in leaves], kind) for kind in both)
     assert float(exact[0][0][4].min()) < 1  # something is seen
     for one_kind, other in zip(exact, ours):
         check_close(other, one_kind, most)
 
 
-@pytest.mark.parametrize("name", SEEN)
+@pytest.mark.parametrize("name", report.SEEN)
 def test_what_a_step_gives_keeps_its_digits(place, name):
-    exact, ours = (compared(SEEN[name], kind, place) for kind in (torch.float64, torch.float32))
+    exact, ours = (report.compared(report.SEEN[name], kind, place) for kind in (torch.float64, torch.float32))
     assert float(exact.pixel_gradient.sum()) > 0
     check_close(parts(ours), parts(exact), COVERED.get(name, 2e-5))
 
 
-@pytest.mark.parametrize("name", UNSEEN)
+@pytest.mark.parametrize("name", report.UNSEEN)
 def test_what_is_not_seen_changes_nothing_and_gets_no_gradient(place, name):
-    function, leaves = drawn(UNSEEN[name])
-    values, gradients = answers(function, [t.to(place) for t in leaves], torch.float32)
+    function, leaves = report.drawn(report.UNSEEN[name])
+    values, gradients = report.answers(function, [t.to(place) for t in leaves], torch.float32)
     assert bool((values[0][4] == 1).all())
     assert not bool(values[0][:4].any())
-    found = compared(UNSEEN[name], torch.float32, place)
-    assert found.loss == pytest.approx(compared(UNSEEN["none at all"], torch.float32, place).loss, rel=1e-6)
+    found, none = (report.compared(report.UNSEEN[n], torch.float32, place) for n in (name, "none at all"))
+    assert found.loss == pytest.approx(none.loss, rel=1e-6)
     assert not any(bool(part.any()) for part in (*gradients, *parts(found)[1:]))
 
 
@@ -89,8 +78,8 @@ def turned(seed):
 @pytest.mark.parametrize("seed", range(0, 200_000, 25_013))
 def test_random_views(place, seed):
     particles, warp, *bases = crowd(40, seed=seed % 97, dtype=torch.float32)
-    hard = Hard(particles, warp, turned(seed), *bases)
-    exact, ours = (compared(hard, kind, place) for kind in (torch.float64, torch.float32))
+    hard = report.Hard(particles, warp, turned(seed), *bases)
+    exact, ours = (report.compared(hard, kind, place) for kind in (torch.float64, torch.float32))
     check_close(parts(ours), parts(exact), 1e-3)
 
 
@@ -100,8 +89,8 @@ def test_thousands_on_one_pixel(place, logit):
     many = Gaussians(*(part.repeat(3000, *[1] * (part.dim() - 1)) for part in particles))
     many.means[:, 2].add_(torch.linspace(0, 1, 3000))
     many.colors.add_(torch.randn(many.colors.shape, generator=torch.Generator().manual_seed(0)))
-    hard = Hard(many, still(many), straight((1, 1)), NO_TINTS, NO_FADES)
-    exact, ours = (compared(hard, kind, place) for kind in (torch.float64, torch.float32))
+    hard = report.Hard(many, still(many), straight((1, 1)), NO_TINTS, NO_FADES)
+    exact, ours = (report.compared(hard, kind, place) for kind in (torch.float64, torch.float32))
     assert ours.loss == pytest.approx(exact.loss, abs=4e-3)
     # What is behind a thousandth of the light is passed over: by opacity, relative to the foremost.
     check_close(parts(ours)[1:], parts(exact)[1:], 5e-3)
@@ -119,15 +108,15 @@ def test_of_a_crowded_tile_the_nearest_are_drawn(place):
     numbers[:, 6:9] = torch.rand(count, 3, generator=generator)
     numbers[:, 9] = torch.linspace(1, 2, count)
     draw = lambda n: rasterize(Splats(n, torch.ones_like(n[:, :2])), 8, 8).color  # noqa: E731
-    exact = answers(draw, [numbers[:looked_at].double().to(place)], torch.float64)
-    ours = answers(draw, [numbers.double().to(place)], torch.float32)
+    exact = report.answers(draw, [numbers[:looked_at].double().to(place)], torch.float64)
+    ours = report.answers(draw, [numbers.double().to(place)], torch.float32)
     check_close(ours[0], exact[0], 1e-3)
     check_close([ours[1][0][:looked_at]], exact[1], 5e-3)
     assert not bool(ours[1][0][looked_at:].any())
 
 
 def test_nodes_keep_their_digits():
-    for row in rows([node_cases]):
+    for row in report.rows([report.node_cases]):
         for column, error in row.items():
             assert column in ("operator", "input") or error is None or error < 1e-6, (row, column)
 
@@ -196,13 +185,10 @@ def test_places_behind_a_lens():
 STILL = {"scales", "quaternions", "opacity", "colors", "sh", "color_over_time", "opacity_over_time"}
 STILL |= {"exposure"}
 MOVING = {"means", "nodes.translations", "nodes.rotations", "skinning.logits"}
+COSINES = {"view_dependence": None, "rotation": None, "motion": "cosines"}
 METHODS = {
     "splines": ({"view_dependence": None}, {}, STILL - {"sh"} | MOVING),
-    "cosines, no rotation": (
-        {"view_dependence": None, "rotation": None, "motion": "cosines"},
-        {},
-        STILL - {"sh"} | MOVING - {"nodes.rotations"},
-    ),
+    "cosines, no rotation": (COSINES, {}, STILL - {"sh"} | MOVING - {"nodes.rotations"}),
     "degree 3": ({"view_dependence": 3}, {}, STILL),
     "a lens": ({"view_dependence": 1}, LENS, STILL),
 }
@@ -239,9 +225,8 @@ def test_a_step_of_the_method(name, monkeypatch):
     gradients = method.look(batch, factors, generator).gradients
     parameters = dict(method.named_parameters())
     assert gradients.keys() == parameters.keys()
-    assert names == (
-        parameters.keys() if names >= MOVING - {"nodes.rotations"} else parameters.keys() - MOVING
-    )
+    moves = names >= MOVING - {"nodes.rotations"}
+    assert names == (parameters.keys() if moves else parameters.keys() - MOVING)
     for which in sorted(names):
         draw = torch.Generator().manual_seed(1)
         value, gradient = parameters[which].data, gradients[which]
@@ -261,13 +246,9 @@ def test_kernels_for_any_processor(tmp_path):
     pytest.importorskip("numba")
     plain = {"NUMBA_CPU_NAME": "generic", "NUMBA_CACHE_DIR": str(tmp_path), "FOREWARP_NUMBA": "1"}
     chosen = ["-m", "not slow", "-k", "not reference", __file__]
-    done = subprocess.run(
-        [sys.executable, "-m", "pytest", "-q", "--no-cov", *chosen],
-        env=os.environ | plain,
-        capture_output=True,
-        text=True,
-        cwd=Path(__file__).parents[2],
-    )
+    options = {"env": os.environ | plain, "capture_output": True, "text": True}
+    command = [sys.executable, "-m", "pytest", "-q", "--no-cov", *chosen]
+    done = subprocess.run(command, cwd=Path(__file__).parents[2], **options)
     assert done.returncode == 0, done.stdout[-3000:]
     assert " passed" in done.stdout
     compiled = {path.name.split(".")[0] for path in tmp_path.rglob("*.nbi")}

@@ -49,10 +49,7 @@ def fit_longer(folder, scene, steps=LONGER):
 
 
 HARD = {
-    **{
-        f"times {times}": (ball_scene(size=16, times=times, canonical_time=times[0]), {})
-        for times in FEW[::3]
-    },
+    **{f"times {t}": (ball_scene(size=16, times=t, canonical_time=t[0]), {}) for t in FEW[::3]},
     "white on white": (pictured(SCENE, 255), {}),
     "without matter": (pictured(SCENE, 0), {}),
     "one opaque image": (replace(SCENE, train=SCENE.train[:1], has_alpha=False), {}),
@@ -142,9 +139,8 @@ def behind_a_lens(scene, lens):
         image = photograph(camera, frame.time)
         return replace(frame, camera=camera, load=lambda: image)
 
-    return replace(
-        scene, **{name: tuple(map(bent, getattr(scene, name))) for name in ("train", "val", "test")}
-    )
+    splits = {name: tuple(map(bent, getattr(scene, name))) for name in ("train", "val", "test")}
+    return replace(scene, **splits)
 
 
 @pytest.mark.slow
@@ -181,9 +177,8 @@ def test_images_of_two_sizes_say_the_same():
     """
     scene, numbers = ball_scene(frames=6, size=48), {"jitter": 0.0, "density": 20.0}
     data, twins_data = (SceneDataModule(lambda of=of: of, rays=1) for of in (scene, enlarged(scene, 2)))
-    module, twin = (
-        module_of(ENTRY, of, model=partial(Particles, **EVERY), numbers=numbers) for of in (data, twins_data)
-    )
+    options = {"model": partial(Particles, **EVERY), "numbers": numbers}
+    module, twin = (module_of(ENTRY, of, **options) for of in (data, twins_data))
     method = shaken(module).method
     method.nodes.seen_times.copy_(torch.tensor([0.0, 1.0]))
     assert float(twin.method.covered_pixels) == 4 * float(method.covered_pixels)
@@ -197,10 +192,8 @@ def test_images_of_two_sizes_say_the_same():
     other.covered_pixels.copy_(twin.method.covered_pixels)
     twin.method = other
     step, larger = look(module, data, 3), look(twin, twins_data, 3)
-    terms, others = (
-        {name: float(v) for name, value in s.terms.items() if (v := value()) is not None}
-        for s in (step, larger)
-    )
+    each = ({name: value() for name, value in s.terms.items()} for s in (step, larger))
+    terms, others = ({name: float(v) for name, v in values.items() if v is not None} for values in each)
     assert terms["photo"] > 0.01
     assert others["photo"] == pytest.approx(terms["photo"], rel=most)
     assert (others["rigid"], others["smooth"]) == (terms["rigid"], terms["smooth"])  # know no images

@@ -176,18 +176,13 @@ def steps_of(run):
     events = EventAccumulator(str(run / "tensorboard"))
     events.Reload()
     rows = read_rows(run / "csv" / "metrics.csv")
-    return [scalar.step for scalar in events.Scalars("train/loss")], [
-        int(row["step"]) for row in rows if row["train/loss"]
-    ]
+    kept = [int(row["step"]) for row in rows if row["train/loss"]]
+    return [scalar.step for scalar in events.Scalars("train/loss")], kept
 
 
 def test_killed_while_loggers_are_on(begin, tmp_path):
-    watched = [
-        "logger=[tensorboard,csv]",
-        "callbacks.scalars.every=1",
-        "evaluate=false",
-        "checkpoint_seconds=0",
-    ]
+    watched = ["logger=[tensorboard,csv]", "callbacks.scalars.every=1", "evaluate=false"]
+    watched += ["checkpoint_seconds=0"]
     whole, killed = tmp_path / "whole", tmp_path / "killed"
     assert begin(whole, *watched)[0] == 0
     for die in ([2, "after", "coarse/last.ckpt"], [3, "after", "fine/last.ckpt"]):

@@ -51,11 +51,9 @@ def fit(folder, scene, iterations, weights=None, model=None, **changes):
 def test_no_term_of_the_loss_depends_on_the_unit_of_length(tmp_path):
     """With all terms on, the first steps are equal except for rounding."""
     weights = dict.fromkeys(VoxelMethod.terms, 0.1)
+    model = forward_model(**{name: EVERYTHING[name] for name in ("inpainter", "background")})
     options = {"iterations": 4, "weights": weights, "start": "hull", "patches": 2, "refresh_every": 2}
-    options |= {
-        "model": forward_model(**{name: EVERYTHING[name] for name in ("inpainter", "background")}),
-        "background_num_voxels": [[0, 12**3]],
-    }
+    options |= {"model": model, "background_num_voxels": [[0, 12**3]]}
     scene = replace(ball_scene(frames=6, size=16), still=torch.tensor([[0.9, 0.1, 0.2], [-0.8, 0.3, -0.2]]))
     _, plain = fit(tmp_path / "a", scene, **options)
     for factor in (1e-3, 2.0**20):
@@ -87,24 +85,21 @@ def pictured(scene, color):
 
 SCENE = ball_scene(frames=4, size=16)
 FEW = ([0.0], [0.5, 0.5], [0.0, 1.0], [0.0, 0.0, 1.0, 1.0])
+HULL = {"iterations": 20, "start": "hull", "refresh_every": 10}
+
+
+def boosted(boost):
+    return {"lr": {kind: boost * rate for kind, rate in RATES.items()}}
+
+
 HARD = {
     **{f"times {times}": (ball_scene(size=16, times=times, canonical_time=times[0]), {}) for times in FEW},
     "white on white": (pictured(SCENE, 255), {"iterations": 12}),
     "without matter": (pictured(SCENE, 0), {"iterations": 20, "start": "hull", "refresh_every": 5}),
     "a camera inside the box": (replace(SCENE, box=Box((-5, -5, -5), (5, 5, 5))), {}),
-    **{
-        f"a scene {thin} thin": (replace(SCENE, box=Box((-1, -0.8, -thin), (1.2, 0.8, thin))), {})
-        for thin in (1e-2, 1e-6)
-    },
+    **{f"{t} thin": (replace(SCENE, box=Box((-1, -0.8, -t), (1.2, 0.8, t))), {}) for t in (1e-2, 1e-6)},
     # Density grows far and voxels leave the box: softplus is linear, the splat drops what is outside.
-    **{
-        f"rates {boost} too high": (
-            SCENE,
-            {"iterations": 20, "lr": {kind: boost * rate for kind, rate in RATES.items()}}
-            | {"start": "hull", "refresh_every": 10},
-        )
-        for boost in (10.0, 300.0)
-    },
+    **{f"rates {boost} too high": (SCENE, HULL | boosted(boost)) for boost in (10.0, 300.0)},
 }
 
 

@@ -18,16 +18,8 @@ from forewarp.renderer import Renderer
 from forewarp.scene.box import Box, Lattice
 from forewarp.scene.view import Moment
 from forewarp.training.schedule import Curriculum
+from tests.support import tiny_scene as tiny
 from tests.support.hard_cases import LATTICE, SHAPE, check_finite, grid, voxels
-from tests.support.tiny_scene import (
-    BOX,
-    EVERYTHING,
-    INPAINTER,
-    backward_model,
-    built,
-    camera_at,
-    forward_model,
-)
 
 pytestmark = pytest.mark.stability
 
@@ -43,9 +35,8 @@ def motion():
 
 @pytest.mark.parametrize("sliver", [1e-9, 1e-7, 1e-4])
 def test_coverage_of_a_billionth(place, sliver):
-    positions = torch.tensor(
-        [[1.0, 1.0, 1.0 - sliver], [0.0, -1 + sliver, 2.0]], device=place
-    ).requires_grad_()
+    positions = torch.tensor([[1.0, 1.0, 1.0 - sliver], [0.0, -1 + sliver, 2.0]], device=place)
+    positions.requires_grad_()
     source = source_of(2, place)
     result = average_splat(source, positions, SHAPE)
     slopes = check_finite((result.values, result.coverage), source, positions)
@@ -153,17 +144,17 @@ def test_total_variation_on_axes_of_one_voxel(device, shape):
 
 
 MODELS = {
-    "everything": forward_model(**EVERYTHING | {"background": None}),
-    "inpainter": forward_model(inpainter=INPAINTER),
-    "backward": backward_model(deformation=partial(Deformation, width=16, layers=2)),
-    "forward": forward_model(),
+    "everything": tiny.forward_model(**tiny.EVERYTHING | {"background": None}),
+    "inpainter": tiny.forward_model(inpainter=tiny.INPAINTER),
+    "backward": tiny.backward_model(deformation=partial(Deformation, width=16, layers=2)),
+    "forward": tiny.forward_model(),
 }
 
 
 def method_of(choice, device):
     torch.manual_seed(0)
-    lattice = Lattice(BOX, (8, 7, 6))
-    made = built(MODELS[choice], lattice, density_scale=lattice.voxel_size)
+    lattice = Lattice(tiny.BOX, (8, 7, 6))
+    made = tiny.built(MODELS[choice], lattice, density_scale=lattice.voxel_size)
     for parameter in made.parameters():  # nothing starts from zero, or half of it has no gradient
         parameter.data += 0.05 * torch.randn(parameter.shape)
     return made.to(device)
@@ -172,9 +163,8 @@ def method_of(choice, device):
 def picture(method, device):
     state = method.at(Moment(0.7))
     field = list(state.fields.values())[-1]
-    drawn = Renderer()(
-        field, camera_at(0.1, 8).rays().to(device), torch.ones(3, device=device), method.view_dependence
-    )
+    rays = tiny.camera_at(0.1, 8).rays().to(device)
+    drawn = Renderer()(field, rays, torch.ones(3, device=device), method.view_dependence)
     return state, drawn
 
 

@@ -41,9 +41,8 @@ def pictures_of(walk: WorldWalk, times, cameras, *, samples: int = 2, workers=No
 
 def smeared(picture: np.ndarray, length: int) -> np.ndarray:
     """The mean of ``length`` copies of (H, W, 3), each a pixel further right: a shaken frame."""
-    moved = [
-        np.roll(picture, shift, 1).astype(np.float32) for shift in range(-(length // 2), length - length // 2)
-    ]
+    shifts = range(-(length // 2), length - length // 2)
+    moved = [np.roll(picture, shift, 1).astype(np.float32) for shift in shifts]
     return np.mean(moved, 0).round().astype(np.uint8)
 
 
@@ -52,9 +51,8 @@ def cameras_on_arc(count=12, radius=4.0, degrees=70.0, height=1.2, focal=300.0, 
     rng, made = np.random.default_rng(1), {}
     for i in range(count):
         angle = math.radians(degrees * (i / (count - 1) - 0.5))
-        center = torch.tensor(
-            [radius * math.sin(angle), -radius * math.cos(angle), height], dtype=torch.float64
-        )
+        place = [radius * math.sin(angle), -radius * math.cos(angle), height]
+        center = torch.tensor(place, dtype=torch.float64)
         up = torch.tensor([roll * rng.normal(), roll * rng.normal(), 1.0])
         pose = look_at(center, torch.zeros(3), up)
         made[f"frame_{i + 1:06d}.jpg"] = Camera(320, 240, focal, focal, 160, 120, pose, 0.0, 0.0, lens=lens)
@@ -67,27 +65,19 @@ def sparse_arc(points=400, outliers=0, error=0.5, **options) -> Reconstruction:
     places = np.concatenate([rng.uniform(-1, 1, (points, 3)), 3000 * rng.normal(size=(outliers, 3))])
     grid = np.meshgrid(np.arange(len(cameras)), np.arange(len(places)), indexing="ij")
     seen = np.stack(grid, -1).reshape(-1, 2)
-    return Reconstruction(
-        cameras,
-        places,
-        rng.integers(0, 256, places.shape).astype(np.uint8),
-        np.full(len(places), error),
-        np.full(len(places), len(cameras)),
-        seen,
-        error,
-    )
+    colors = rng.integers(0, 256, places.shape).astype(np.uint8)
+    errors, lengths = np.full(len(places), error), np.full(len(places), len(cameras))
+    return Reconstruction(cameras, places, colors, errors, lengths, seen, error)
 
 
 def write_model(folder, cameras, points, model="OPENCV", lens=(0.0, 0.0, 0.0, 0.0)):
     """Write a COLMAP model as text, by hand: each point is seen by all cameras."""
     folder.mkdir(parents=True)
     one = next(iter(cameras.values()))
-    numbers = {
-        "OPENCV": (one.fx, one.fy, one.cx, one.cy, *lens),
-        "SIMPLE_RADIAL": (one.fx, one.cx, one.cy, lens[0]),
-        "SIMPLE_DIVISION": (one.fx, one.cx, one.cy, lens[0]),
-        "OPENCV_FISHEYE": (one.fx, one.fy, one.cx, one.cy, *lens),
-    }[model]
+    if model.startswith("OPENCV"):
+        numbers = one.fx, one.fy, one.cx, one.cy, *lens
+    else:
+        numbers = one.fx, one.cx, one.cy, lens[0]
     (folder / "cameras.txt").write_text(f"1 {model} {one.width} {one.height} {' '.join(map(str, numbers))}\n")
     lines = []
     for number, (name, camera) in enumerate(cameras.items(), 1):

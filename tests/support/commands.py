@@ -16,11 +16,9 @@ from hydra.core.hydra_config import HydraConfig
 
 # A scene of 32 x 32 pixels, with test views of all three kinds.
 SCENE = {"size": 32, "frames": 6, "test_views": (2, 1, 2), "val_views": 1, "samples_per_pixel": 1}
-TINY = [
-    *("model=forward", "data=dnerf", "data.scene=vehicle", "preset=demo", "trainer=cpu", "data.rays=128"),
-    "threads=1",
-    *("budget.iterations=60", "stage.fine.num_voxels=[[0,8000]]", "stage.coarse.num_voxels=[[0,4000]]"),
-]
+TINY = ["model=forward", "data=dnerf", "data.scene=vehicle", "preset=demo", "trainer=cpu", "data.rays=128"]
+TINY += ["budget.iterations=60", "stage.fine.num_voxels=[[0,8000]]", "stage.coarse.num_voxels=[[0,4000]]"]
+TINY += ["threads=1"]
 
 
 def call(name, *arguments):
@@ -32,19 +30,12 @@ def call(name, *arguments):
     level, disabled, threads = quiet.level, logging.root.manager.disable, torch.get_num_threads()
     # Hydra composes the config once more to learn its hydra.mode, which only sweeps set.
     sweeps = any(str(argument).startswith("sweeps=") for argument in arguments)
-    mode = (
-        contextlib.nullcontext()
-        if sweeps
-        else patch("hydra._internal.hydra.Hydra.get_mode", return_value=None)
-    )
+    mode = patch("hydra._internal.hydra.Hydra.get_mode", return_value=None)
+    mode = contextlib.nullcontext() if sweeps else mode
     status = None
-    with (
-        mode,
-        patch.dict(os.environ),
-        patch("sys.argv", [f"forewarp-{name}", *map(str, arguments)]),
-        contextlib.redirect_stdout(out),
-        contextlib.redirect_stderr(err),
-    ):
+    typed = patch("sys.argv", [f"forewarp-{name}", *map(str, arguments)])
+    told = contextlib.redirect_stdout(out), contextlib.redirect_stderr(err)
+    with mode, patch.dict(os.environ), typed, told[0], told[1]:
         try:
             importlib.import_module(f"forewarp.cli.{name}").main()
         except SystemExit as leaving:

@@ -35,8 +35,7 @@ def write_film(path, frames, *, stamps="N*40", rotation=0, options=(), inputs=()
 
 def numbered(count, size=(48, 64), step=8):
     """Frames (N, H, W, 3) whose grey tells their number, the upper left quarter bright."""
-    frames = (
-        np.zeros((count, *size, 3), np.uint8) + step * np.arange(count, dtype=np.uint8)[:, None, None, None]
-    )
+    grey = step * np.arange(count, dtype=np.uint8)[:, None, None, None]
+    frames = np.zeros((count, *size, 3), np.uint8) + grey
     frames[:, : size[0] // 2, : size[1] // 2] = 250
     return frames

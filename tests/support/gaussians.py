@@ -23,22 +23,17 @@ def straight(size=(16, 16), **changes):
     return Pinhole(eye, (0.0, 0.0, -4.0), (40.0, 40.0), middle, size, 0.2, **changes)
 
 
-def crowd(
-    count=60, nodes=5, degree=2, color_basis=2, opacity_basis=2, dtype=torch.float64, seed=0, scale=-2.0
-):
+def crowd(count=60, nodes=5, degree=2, color_basis=2, opacity_basis=2, dtype=torch.float64, seed=0, scale=-2):
     """Random particles, how they move, and what a time makes of colour and opacity."""
     generator = torch.Generator().manual_seed(seed)
 
     def random(*shape):
         return torch.randn(*shape, generator=generator, dtype=torch.float64).to(dtype)
 
-    particles = Gaussians(
-        0.5 * random(count, 3),
-        scale + 0.5 * random(count, 3),
-        random(count, 4),
-        random(count, opacity_basis),
-        0.3 * random(count, (degree + 1) ** 2 + color_basis, 3),
-    )
+    means, log_scales = 0.5 * random(count, 3), scale + 0.5 * random(count, 3)
+    quaternions, opacity = random(count, 4), random(count, opacity_basis)
+    colors = 0.3 * random(count, (degree + 1) ** 2 + color_basis, 3)
+    particles = Gaussians(means, log_scales, quaternions, opacity, colors)
     links = torch.randint(0, nodes, (count, 4), generator=generator).int()
     shares = torch.rand(count, 4, generator=generator, dtype=torch.float64).to(dtype)
     warp = Warp(0.1 * random(nodes, 12), links, shares / shares.sum(-1, keepdim=True))
@@ -48,14 +43,10 @@ def crowd(
 
 def one(mean=(0.0, 0.0, 0.0), scale=0.1, opacity=0.0, color=(0.0, 0.0, 0.0), quaternion=(1.0, 0.0, 0.0, 0.0)):
     """A single particle that nothing moves, float32; ``opacity`` is a logit, ``color`` is added to 1/2."""
-    scales = torch.as_tensor(scale, dtype=torch.float32).expand(3)
-    return Gaussians(
-        torch.tensor([mean], dtype=torch.float32),
-        scales.log()[None].clone(),
-        torch.tensor([quaternion], dtype=torch.float32),
-        torch.tensor([[opacity]], dtype=torch.float32),
-        (torch.tensor([[color]], dtype=torch.float32) / 0.28209479177387814),
-    )
+    scales = torch.as_tensor(scale, dtype=torch.float32).expand(3).log()[None].clone()
+    numbers = ([mean], [quaternion], [[opacity]], [[color]])
+    means, quaternions, logits, added = (torch.tensor(n, dtype=torch.float32) for n in numbers)
+    return Gaussians(means, scales, quaternions, logits, added / 0.28209479177387814)
 
 
 def together(*parts):

@@ -86,9 +86,8 @@ def bend(x, y, k, p):
     """Where OpenCV's lens puts a point of the plane z = 1."""
     r2 = x * x + y * y
     s = 1 + k[0] * r2 + k[1] * r2**2 + k[2] * r2**3
-    return x * s + 2 * p[0] * x * y + p[1] * (r2 + 2 * x * x), y * s + 2 * p[1] * x * y + p[0] * (
-        r2 + 2 * y * y
-    )
+    across = x * s + 2 * p[0] * x * y + p[1] * (r2 + 2 * x * x)
+    return across, y * s + 2 * p[1] * x * y + p[0] * (r2 + 2 * y * y)
 
 
 # the core --------------------------------------------------------------------------------------------------

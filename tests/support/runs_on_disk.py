@@ -29,15 +29,10 @@ def write_run(
     """
     folder = Path(root) / scene / f"{variant}-{minutes}-seed{seed}"
     (folder / "coarse").mkdir(parents=True)
-    whole = {
-        "data": {"scene": scene},
-        "model": {"name": "forward"},
-        "preset": {"name": "fast"},
-        "budget": {"minutes": minutes},
-        "variant": {"name": variant} | ({"about": f"the {variant}", "against": against} if against else {}),
-        "seed": seed,
-        "command": command or f"forewarp-train variant={variant} seed={seed}",
-    }
+    variant_of = {"name": variant} | ({"about": f"the {variant}", "against": against} if against else {})
+    whole = {"data": {"scene": scene}, "model": {"name": "forward"}, "preset": {"name": "fast"}}
+    whole |= {"budget": {"minutes": minutes}, "variant": variant_of, "seed": seed}
+    whole["command"] = command or f"forewarp-train variant={variant} seed={seed}"
     (folder / "config.yaml").write_text(yaml.safe_dump(whole | (config or {})))
     (folder / "coarse" / "done.json").write_text(json.dumps({"steps": steps, "seconds": 50.0}))
     if psnr is not None:

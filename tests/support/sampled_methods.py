@@ -61,9 +61,8 @@ def learned(kind, folder, read=moving_scene, *, iterations=260, rays=96):
     Squared errors are pooled, as in ``static_ceiling``: a mean of PSNRs has no ceiling, since one picture may
     be shown exactly.
     """
-    settings = StageSettings.of(
-        "fine", lr={"network": 5e-3}, iterations=iterations, curriculum={"all_in": 0.0}
-    )
+    options = {"iterations": iterations, "curriculum": {"all_in": 0.0}}
+    settings = StageSettings.of("fine", lr={"network": 5e-3}, **options)
     weights = dict.fromkeys({"photo", "coarse_photo"} & set(KINDS[kind].func.terms), 1.0)
     data = SceneDataModule(read, rays=rays)
     model = partial(KINDS[kind], sampling=Sampling(12, 12, **GENTLE))

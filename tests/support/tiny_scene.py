@@ -11,15 +11,8 @@ from forewarp.data.module import SceneDataModule
 from forewarp.fields.curves import TrajectoryField
 from forewarp.fields.grids import DirectRadiance, FeatureRadiance
 from forewarp.methods.method import Start
+from forewarp.methods.voxel import effects
 from forewarp.methods.voxel.backward import BackwardWarp
-from forewarp.methods.voxel.effects import (
-    LearnedUpsampler,
-    Motion,
-    SphericalHarmonics,
-    StaticBackground,
-    UNet3d,
-    ViewNetwork,
-)
 from forewarp.methods.voxel.forward import ForwardWarp
 from forewarp.methods.voxel.model import VoxelMethod, VoxelSnapshot
 from forewarp.methods.voxel.structure import VoxelStage
@@ -89,13 +82,13 @@ def ball_data(rays=256, seed=0, **changes):
 
 RADIANCE = partial(DirectRadiance, alpha_init=1e-2, alpha_threshold=1e-4)
 FEATURES = partial(FeatureRadiance, alpha_init=1e-2, alpha_threshold=0.0, width=8)
-INPAINTER = partial(UNet3d, width=16, levels=2)
+INPAINTER = partial(effects.UNet3d, width=16, levels=2)
 EVERYTHING = {
     "radiance": FEATURES,
-    "view_dependence": ViewNetwork,
-    "upsampler": partial(LearnedUpsampler, width=8),
+    "view_dependence": effects.ViewNetwork,
+    "upsampler": partial(effects.LearnedUpsampler, width=8),
     "inpainter": INPAINTER,
-    "background": partial(StaticBackground, features=3, alpha_init=1e-2, alpha_threshold=1e-4),
+    "background": partial(effects.StaticBackground, features=3, alpha_init=1e-2, alpha_threshold=1e-4),
 }
 
 
@@ -103,27 +96,26 @@ def forward_model(**changes):
     """Make a cheap forward model: colours in the voxels, few bases."""
     choices = {
         "radiance": RADIANCE,
-        "motion": Motion,
+        "motion": effects.Motion,
         "trajectory": partial(TrajectoryField, bases=4, nodes=8, width=32, layers=3),
-        "view_dependence": SphericalHarmonics,
+        "view_dependence": effects.SphericalHarmonics,
     }
     return partial(ForwardWarp, **(choices | changes))
 
 
 def backward_model(**changes):
     """Make a cheap backward model; name its ``deformation``."""
-    return partial(BackwardWarp, **({"radiance": RADIANCE, "view_dependence": SphericalHarmonics} | changes))
+    choices = {"radiance": RADIANCE, "view_dependence": effects.SphericalHarmonics}
+    return partial(BackwardWarp, **(choices | changes))
 
 
-def built(
-    model, lattice, active=None, *, density_scale=0.3, frames=5, canonical_time=0.0, box=BOX, **numbers
-):
-    """Make a model's method on a lattice, by default fully active; ``numbers`` are of its stage."""
+def built(model, lattice, active=None, *, density_scale=0.3, frames=5, canonical_time=0.0, box=BOX, **own):
+    """Make a model's method on a lattice, by default fully active; ``own`` are numbers of its stage."""
     everywhere = torch.ones(lattice.shape, dtype=torch.bool)
     train = tuple(Frame(str(i), i / max(frames - 1, 1), camera_at(0.0), None) for i in range(frames))
     scene = Scene("ball", train, (), (), box, canonical_time, has_alpha=True)
     handover = Handover(box, True, frames, notes={"density_scale": density_scale})
-    start = Start(scene, "fine", {"num_voxels": [[0, 500]]} | numbers, (), handover, blank=True)
+    start = Start(scene, "fine", {"num_voxels": [[0, 500]]} | own, (), handover, blank=True)
     background = on(model.keywords.get("background"), lattice, everywhere)
     radiance = on(model.keywords["radiance"], lattice, everywhere if active is None else active)
     return model(start, radiance=radiance, background=background)
@@ -158,17 +150,10 @@ def begun(method, scene, made):
 
 def stage(name="coarse", weights=None, photo_on=None, **changes):
     """Make a stage of few steps on a small lattice."""
-    numbers = {
-        "num_voxels": [[0, 14**3]],
-        "iterations": 12,
-        "keep_alpha": 1e-2,
-        "birth_alpha": 5e-3,
-        "lr": RATES,
-    }
-    objective = Objective(
-        {"photo": 1.0, "point_color": 0.01, "tv_flow": 1e-3} if weights is None else weights,
-        photo_on=photo_on,
-    )
+    numbers = {"num_voxels": [[0, 14**3]], "iterations": 12, "keep_alpha": 1e-2, "birth_alpha": 5e-3}
+    numbers |= {"lr": RATES} | changes
+    weights = {"photo": 1.0, "point_color": 0.01, "tv_flow": 1e-3} if weights is None else weights
+    objective = Objective(weights, photo_on=photo_on)
     return Stage(StageSettings.of(name, **(numbers | changes)), objective)
 
 
@@ -182,15 +167,9 @@ def trainer(callbacks, **changes):
 
 def make_run(folder, stages, *, data=None, model=None, callbacks=(), **changes):
     """Make a run over the ball scene in ``folder``."""
-    return Run(
-        data or ball_data(),
-        model or forward_model(),
-        stages,
-        Path(folder),
-        lambda where, own, loggers: trainer(own, logger=loggers, default_root_dir=str(where)),
-        callbacks=lambda name, where: list(callbacks),
-        **changes,
-    )
+    made = lambda where, own, loggers: trainer(own, logger=loggers, default_root_dir=str(where))  # noqa: E731
+    changes["callbacks"] = lambda name, where: list(callbacks)
+    return Run(data or ball_data(), model or forward_model(), stages, Path(folder), made, **changes)
 
 
 def same(one, other):
@@ -252,9 +231,5 @@ class KnownBall(VoxelMethod):
 
 def known_ball():
     """Make a module of it."""
-    return DynamicSceneModule(
-        KnownBall().fill(0.0),
-        objective=Objective({}),
-        settings=stage().settings,
-        curriculum=Curriculum([0.0, 1.0], 0.0),
-    )
+    options = {"objective": Objective({}), "settings": stage().settings}
+    return DynamicSceneModule(KnownBall().fill(0.0), curriculum=Curriculum([0.0, 1.0], 0.0), **options)

@@ -116,9 +116,8 @@ def phone(index, size=(12, 8), skew=0.0):
     offset = torch.tensor([4 * np.cos(angle), 4 * np.sin(angle), 1.0], dtype=torch.float64)
     width, height = size
     inner = (1.1 * width, 1.026 * 1.1 * width, 0.52 * width, 0.47 * height)
-    return Camera(
-        *size, *inner, look_at(middle + offset, middle, UP), NEAR, FAR, skew, LENS if index % 2 else None
-    )
+    lens = LENS if index % 2 else None
+    return Camera(*size, *inner, look_at(middle + offset, middle, UP), NEAR, FAR, skew, lens)
 
 
 def rig(times=5, **options):
@@ -146,9 +145,8 @@ def film(times=4, size=(12, 8), unit=1.0):
         depth, trust = unit * rng.uniform(3.5, 4.5, size[::-1]), np.ones(size[::-1])
         depth[:2, :2], trust[4:6, 4:6] = 0, 0.5
         points = np.array([[2.0 * t, 4.0, 1], [6, 2, t % 2]])
-        yield hypernerf.RigShot(
-            f"0_{t:05d}", t, 0, "train", camera, noise(rng, camera), depth, trust, keypoints=points
-        )
+        about = f"0_{t:05d}", t, 0, "train", camera, noise(rng, camera), depth, trust
+        yield hypernerf.RigShot(*about, keypoints=points)
         seen = np.arange(size[0])[None] < np.full(size[::-1], size[0] // 2)
         yield hypernerf.RigShot(f"1_{t:05d}", t, 1, "val", beside, noise(rng, beside), covisible=seen)
 
@@ -237,9 +235,8 @@ def posed_shots(count=10, channels=3, times=None, suffix=".png", splits=None, vi
     rng = np.random.default_rng(0)
     for i, camera in enumerate(views or posed_cameras(count)):
         time, split = None if times is None else times[i], splits[i] if splits else ""
-        yield posed_video.PosedShot(
-            f"frame_{i + 1}{suffix}", camera, noise(rng, camera, channels), time, split
-        )
+        name = f"frame_{i + 1}{suffix}"
+        yield posed_video.PosedShot(name, camera, noise(rng, camera, channels), time, split)
 
 
 def write_video(folder: Path, near=20.0, far=120.0, aabb=None, **options) -> Path:

@@ -15,37 +15,17 @@ from forewarp.fields.curves import TrajectoryField
 from forewarp.methods.method import Method, Start
 from forewarp.scene.box import Box
 from forewarp.scene.cloud import Cloud, Handover
-from forewarp.training.checkpoints import (
-    KeepCheckpoint,
-    check_checkpoint,
-    check_state,
-    load_handover,
-    load_weights,
-    make_handover,
-    read_archive,
-    save_handover,
-    write_archive,
-)
-from tests.support.tiny_scene import (
-    BOX,
-    RADIUS,
-    Interrupt,
-    ball_center,
-    ball_data,
-    ball_method,
-    ball_scene,
-    forward_model,
-    make_run,
-    stage,
-)
+from forewarp.training import checkpoints
+from tests.support import tiny_scene as tiny
 
 
 def run(folder, callbacks=(), width=8, times=None):
     """A run of one short stage."""
     trajectory = partial(TrajectoryField, bases=2, nodes=8, width=width, layers=2)
-    data = ball_data(rays=64, size=16, times=times)
-    model = forward_model(trajectory=trajectory)
-    return make_run(folder, [stage(num_voxels=[[0, 1000]])], data=data, model=model, callbacks=callbacks)
+    data = tiny.ball_data(rays=64, size=16, times=times)
+    model = tiny.forward_model(trajectory=trajectory)
+    stages = [tiny.stage(num_voxels=[[0, 1000]])]
+    return tiny.make_run(folder, stages, data=data, model=model, callbacks=callbacks)
 
 
 def module(folder, **changes):
@@ -60,7 +40,7 @@ def interrupted(tmp_path_factory):
     """The checkpoint of a stage that was interrupted."""
     folder = tmp_path_factory.mktemp("interrupted")
     with pytest.raises(SystemExit):
-        run(folder, [Interrupt("coarse", 3)]).fit()
+        run(folder, [tiny.Interrupt("coarse", 3)]).fit()
     return folder / "coarse" / "last.ckpt"
 
 
@@ -71,7 +51,7 @@ def interrupted(tmp_path_factory):
 )
 def test_another_configuration_is_refused_by_what_differs(tmp_path, interrupted, changes, name):
     with pytest.raises(ValueError, match=f"a checkpoint of this configuration, but .* differs in {name}"):
-        load_weights(module(tmp_path, **changes), interrupted)
+        checkpoints.load_weights(module(tmp_path, **changes), interrupted)
 
 
 def test_one_flipped_bit_is_refused(tmp_path, interrupted):
@@ -81,7 +61,7 @@ def test_one_flipped_bit_is_refused(tmp_path, interrupted):
     content[at + 3] ^= 1
     (tmp_path / "last.ckpt").write_bytes(content)
     with pytest.raises(ValueError, match="last.ckpt: expected a checkpoint, but it cannot be read .BadZip"):
-        check_checkpoint(tmp_path / "last.ckpt", module(tmp_path))
+        checkpoints.check_checkpoint(tmp_path / "last.ckpt", module(tmp_path))
 
 
 def test_a_checkpoint_cannot_execute_code(tmp_path):
@@ -91,13 +71,14 @@ def test_a_checkpoint_cannot_execute_code(tmp_path):
 
     torch.save({"state_dict": {"a": Deed()}}, tmp_path / "last.ckpt")
     with pytest.raises(ValueError, match="last.ckpt: expected a checkpoint, but it cannot be read"):
-        check_checkpoint(tmp_path / "last.ckpt", module(tmp_path))
+        checkpoints.check_checkpoint(tmp_path / "last.ckpt", module(tmp_path))
     assert not (tmp_path / "deed").exists()
 
 
 def test_checkpoints_come_by_the_clock(tmp_path, monkeypatch):
     saved = []
-    monkeypatch.setattr(KeepCheckpoint, "save", lambda self, trainer: saved.append(trainer.global_step))
+    save = lambda self, trainer: saved.append(trainer.global_step)  # noqa: E731
+    monkeypatch.setattr(checkpoints.KeepCheckpoint, "save", save)
     ours = run(tmp_path)
     ours.checkpoint_seconds = 1e-9
     ours.fit()
@@ -132,12 +113,10 @@ def test_a_grid_whose_parts_do_not_fit_is_refused(tmp_path, interrupted, harm):
     torch.save(content, tmp_path / "last.ckpt")
     named = "(index|_extra_state)" if "shape" in harm else name
     with pytest.raises(ValueError, match=f"last.ckpt: expected .* that differs in {GRID}{named};"):
-        load_weights(module(tmp_path), tmp_path / "last.ckpt")
+        checkpoints.load_weights(module(tmp_path), tmp_path / "last.ckpt")
 
 
-INCOMPLETE = (
-    "expected a checkpoint with its step and generator, torch_rng, curriculum, clock, but got one without"
-)
+INCOMPLETE = "expected a checkpoint with its step and generator, torch_rng, curriculum, clock, but got one"
 
 
 @pytest.mark.parametrize(
@@ -156,7 +135,7 @@ def test_odd_parts_are_refused_in_one_line(tmp_path, interrupted, change, said):
     change(content)
     torch.save(content, tmp_path / "last.ckpt")
     with pytest.raises(ValueError, match=f"last.ckpt: .*{said}"):
-        check_state(tmp_path / "last.ckpt", module(tmp_path))
+        checkpoints.check_state(tmp_path / "last.ckpt", module(tmp_path))
 
 
 CONTENT = {"a": torch.arange(1000.0), "b": {"c": [1, "x", None]}}
@@ -164,39 +143,38 @@ CONTENT = {"a": torch.arange(1000.0), "b": {"c": [1, "x", None]}}
 
 def test_a_full_disk_is_told_and_leaves_what_was_there(tmp_path):
     path = tmp_path / "a.pt"
-    write_archive(path, {"a": 1})
+    checkpoints.write_archive(path, {"a": 1})
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (2048, before[1]))
     try:
         with pytest.raises(OSError, match="File too large") as refusal:
-            write_archive(path, CONTENT)
+            checkpoints.write_archive(path, CONTENT)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
     assert refusal.value.filename == str(path)
-    assert read_archive(path) == {"a": 1}
+    assert checkpoints.read_archive(path) == {"a": 1}
     assert [path.name for path in tmp_path.iterdir()] == ["a.pt"]
 
 
 def test_a_packed_archive_is_not_unpacked(tmp_path):
     """Zeros of 16 MB in a file of 16 KB."""
     torch.save({"a": torch.zeros(1 << 22)}, tmp_path / "plain.pt")
-    with (
-        zipfile.ZipFile(tmp_path / "plain.pt") as plain,
-        zipfile.ZipFile(tmp_path / "a.pt", "w", zipfile.ZIP_DEFLATED) as packed,
-    ):
-        for name in plain.namelist():
-            packed.writestr(name, plain.read(name))
+    with zipfile.ZipFile(tmp_path / "plain.pt") as plain:
+        parts = {name: plain.read(name) for name in plain.namelist()}
+    with zipfile.ZipFile(tmp_path / "a.pt", "w", zipfile.ZIP_DEFLATED) as packed:
+        for name, part in parts.items():
+            packed.writestr(name, part)
     assert torch.load(tmp_path / "a.pt", weights_only=True)["a"].shape == (1 << 22,)  # torch would
     with pytest.raises(ValueError, match="BadZipFile"):
-        read_archive(tmp_path / "a.pt")
+        checkpoints.read_archive(tmp_path / "a.pt")
 
 
 def test_no_tensor_is_larger_than_the_file(tmp_path):
     torch.save({"a": [{"b": torch.zeros(1).expand(400, 1000, 1000)}]}, tmp_path / "a.pt")
     with pytest.raises(ValueError, match="TypeError"):
-        read_archive(tmp_path / "a.pt")
+        checkpoints.read_archive(tmp_path / "a.pt")
     torch.save({"a": torch.zeros(6, 5).T, "b": torch.zeros(0, 3)}, tmp_path / "a.pt")
-    assert read_archive(tmp_path / "a.pt")["a"].shape == (5, 6)
+    assert checkpoints.read_archive(tmp_path / "a.pt")["a"].shape == (5, 6)
 
 
 @pytest.mark.parametrize("content", [b"", b"nonsense", [1], torch.zeros(3), {"a": torch.eye(3).to_sparse()}])
@@ -206,14 +184,14 @@ def test_what_is_no_such_file_is_refused(tmp_path, content):
     else:
         torch.save(content, tmp_path / "a.pt")
     with pytest.raises(ValueError, match="^[A-Z]\\w+$"):
-        read_archive(tmp_path / "a.pt")
+        checkpoints.read_archive(tmp_path / "a.pt")
     with pytest.raises(FileNotFoundError):
-        read_archive(tmp_path / "b.pt")
+        checkpoints.read_archive(tmp_path / "b.pt")
 
 
 # The handover of a stage: what it contains, and that it is written and read correctly.
 
-SCENE = ball_scene(frames=6, size=16)
+SCENE = tiny.ball_scene(frames=6, size=16)
 
 
 @pytest.mark.parametrize("moving", [True, False])
@@ -221,8 +199,8 @@ def test_round_trip(tmp_path, moving):
     cloud = Cloud(torch.rand(5, 3), torch.rand(5, 3), torch.rand(5), 0.25)
     times, paths = (torch.rand(4), torch.rand(5, 4, 3)) if moving else (None, None)
     box, notes = Box((-1.0, 0.25, 1 / 3), (1.0, 2.0, 3.0)), {"density_scale": 0.1}
-    save_handover(Handover(box, True, 17, cloud, times, paths, notes), tmp_path)
-    read = load_handover(tmp_path)
+    checkpoints.save_handover(Handover(box, True, 17, cloud, times, paths, notes), tmp_path)
+    read = checkpoints.load_handover(tmp_path)
     assert (read.box, read.tight, read.frames_in_play, read.notes) == (box, True, 17, notes)
     assert_close(vars(read.cloud), vars(cloud), rtol=0, atol=0)
     assert not moving or (read.times.equal(times) and read.paths.equal(paths))
@@ -249,59 +227,59 @@ def _numbers(**changes):
 )
 def test_what_is_no_handover_is_refused_in_one_line(tmp_path, spoil):
     cloud = Cloud(torch.rand(5, 3), torch.rand(5, 3), torch.rand(5), 0.25)
-    save_handover(Handover(BOX, True, 3, cloud, notes={"density_scale": 0.1}), tmp_path)
-    load_handover(tmp_path)
+    checkpoints.save_handover(Handover(tiny.BOX, True, 3, cloud, notes={"density_scale": 0.1}), tmp_path)
+    checkpoints.load_handover(tmp_path)
     spoil(tmp_path / "handover.json", tmp_path / "handover.pt")
     with pytest.raises(ValueError, match=r"handover\.\w+: expected what a stage leaves to the next, but got"):
-        load_handover(tmp_path)
+        checkpoints.load_handover(tmp_path)
 
 
 def test_a_stage_leaves_the_tight_box():
-    method = ball_method(SCENE)
-    handover = make_handover(method, SCENE, None, 6)
+    method = tiny.ball_method(SCENE)
+    handover = checkpoints.make_handover(method, SCENE, None, 6)
     assert handover.tight
     assert handover.notes == {"density_scale": method.radiance.activation.density_scale}
     assert handover.frames_in_play == 6
-    center, margin = ball_center(0.0), RADIUS + 4 * method.radiance.lattice.voxel_size
+    center, margin = tiny.ball_center(0.0), tiny.RADIUS + 4 * method.radiance.lattice.voxel_size
     for low, high, middle in zip(handover.box.low, handover.box.high, center.tolist()):
-        assert middle - margin < low < middle - 0.5 * RADIUS
-        assert middle + 0.5 * RADIUS < high < middle + margin
+        assert middle - margin < low < middle - 0.5 * tiny.RADIUS
+        assert middle + 0.5 * tiny.RADIUS < high < middle + margin
 
 
 def test_the_box_holds_what_the_stage_calls_matter():
-    method, asked = ball_method(SCENE, box_alpha=0.25), []
+    method, asked = tiny.ball_method(SCENE, box_alpha=0.25), []
     bounds = method.bounds
     method.bounds = lambda times: asked.append(times) or bounds(times)
-    thin = ball_method(SCENE, raw=2.0, box_alpha=0.25)  # an opacity of 0.07 over a voxel
-    assert make_handover(method, SCENE, None, 6).tight
+    thin = tiny.ball_method(SCENE, raw=2.0, box_alpha=0.25)  # an opacity of 0.07 over a voxel
+    assert checkpoints.make_handover(method, SCENE, None, 6).tight
     assert asked == [list(SCENE.times)]
-    assert not make_handover(thin, SCENE, None, 6).tight
-    assert make_handover(ball_method(SCENE, raw=2.0, box_alpha=0.01), SCENE, None, 6).tight
+    assert not checkpoints.make_handover(thin, SCENE, None, 6).tight
+    assert checkpoints.make_handover(tiny.ball_method(SCENE, raw=2.0, box_alpha=0.01), SCENE, None, 6).tight
 
 
 def test_a_stage_leaves_its_matter_and_the_paths_of_it_or_a_sample(monkeypatch):
-    method = ball_method(SCENE)
-    handover, matter = make_handover(method, SCENE, None, 6), method.matter()
+    method = tiny.ball_method(SCENE)
+    handover, matter = checkpoints.make_handover(method, SCENE, None, 6), method.matter()
     assert 20 < len(handover.cloud) == len(matter)
     assert handover.cloud.points.equal(matter.points)
-    assert float((matter.points - ball_center(0.0)).norm(dim=-1).max()) < RADIUS
+    assert float((matter.points - tiny.ball_center(0.0)).norm(dim=-1).max()) < tiny.RADIUS
     assert handover.times.tolist() == pytest.approx(list(SCENE.times))
     assert handover.paths.equal(method.trajectories(matter.points, handover.times))
     monkeypatch.setattr("forewarp.training.checkpoints._POINTS", 7)
     monkeypatch.setattr("forewarp.training.checkpoints._TIMES", 3)
-    handover = make_handover(method, SCENE, None, 6)
+    handover = checkpoints.make_handover(method, SCENE, None, 6)
     assert handover.paths.shape == (7, 3, 3)
     assert handover.times.tolist() == pytest.approx([SCENE.times[i] for i in (0, 2, 4)], abs=0.21)
 
 
-@pytest.mark.parametrize("box", [None, BOX.scaled(0.5)])
+@pytest.mark.parametrize("box", [None, tiny.BOX.scaled(0.5)])
 def test_a_stage_that_found_nothing_keeps_its_box_and_says_so(box):
     before = None if box is None else Handover(box, True, 6)
-    method = forward_model()(Start(SCENE, "coarse", {"num_voxels": [[0, 1500]]}, range(6), before))
+    method = tiny.forward_model()(Start(SCENE, "coarse", {"num_voxels": [[0, 1500]]}, range(6), before))
     method.radiance.density.data[:] = -9.0
-    handover = make_handover(method, SCENE, before, 6)
+    handover = checkpoints.make_handover(method, SCENE, before, 6)
     assert not handover.tight
-    assert handover.box == method.radiance.lattice.box == (box or BOX)
+    assert handover.box == method.radiance.lattice.box == (box or tiny.BOX)
     assert len(handover.cloud) == 0
 
 
@@ -314,14 +292,14 @@ class Astray(Method):
 
 @pytest.mark.parametrize("method", [Astray, Method])
 def test_of_a_method_that_can_tell_nothing_the_box_is_left(tmp_path, method):
-    handover = make_handover(method(), SCENE, None, 4)
-    assert handover == Handover(BOX, False, 4)
-    save_handover(handover, tmp_path)
-    assert load_handover(tmp_path) == handover
+    handover = checkpoints.make_handover(method(), SCENE, None, 4)
+    assert handover == Handover(tiny.BOX, False, 4)
+    checkpoints.save_handover(handover, tmp_path)
+    assert checkpoints.load_handover(tmp_path) == handover
     assert not (tmp_path / "handover.pt").exists()
 
 
 def test_what_lies_outside_the_scene_is_cut_off():
-    far = replace(SCENE, box=BOX.scaled(0.3))
-    box = make_handover(ball_method(SCENE), far, None, 6).box
+    far = replace(SCENE, box=tiny.BOX.scaled(0.3))
+    box = checkpoints.make_handover(tiny.ball_method(SCENE), far, None, 6).box
     assert all(high <= edge + 1e-6 for high, edge in zip(box.high, far.box.scaled(1.05).high))

@@ -14,12 +14,7 @@ from forewarp.training.loggers import CsvLogger, RunLoggers
 from tests.support.tiny_scene import Interrupt, make_run, stage
 
 STEPS = 6
-PARAMETERS = {
-    "model.name": "forward",
-    "stage.fine.density": 45.0,
-    "preset.rays": "None",
-    "model.rotation": True,
-}
+PARAMETERS = {"model.name": "forward", "stage.fine.density": 45.0, "preset.rays": "None", "model.still": True}
 SCORES = {"test/all/psnr": 30.5}
 
 
@@ -72,10 +67,8 @@ def interrupted_and_continued(folder, makers):
 
 @pytest.fixture
 def plain():
-    return {
-        "tensorboard": partial(TensorBoardLogger, name="tensorboard", version="", default_hp_metric=False),
-        "csv": partial(CsvLogger, name="csv", version=""),
-    }
+    tensorboard = partial(TensorBoardLogger, name="tensorboard", version="", default_hp_metric=False)
+    return {"tensorboard": tensorboard, "csv": partial(CsvLogger, name="csv", version="")}
 
 
 def test_stages_are_one_curve_and_a_continued_run_goes_on_in_it(tmp_path, plain):

@@ -38,10 +38,8 @@ def module(model=None, weights=None, renderer=None, **changes):
         torch.nn.init.normal_(method.radiance.parameter(name))
     method.renderer = renderer or method.renderer
     made = tiny.stage(weights=weights, **changes)
-    method, curriculum = (
-        tiny.begun(method, DATA.scene, made),
-        Curriculum([f.time for f in DATA.scene.train], 0.0),
-    )
+    curriculum = Curriculum([f.time for f in DATA.scene.train], 0.0)
+    method = tiny.begun(method, DATA.scene, made)
     return DynamicSceneModule(method, objective=made.objective, settings=made.settings, curriculum=curriculum)
 
 

@@ -15,9 +15,8 @@ def step_of(**values):
 
 def test_the_loss_is_the_weighted_sum_of_the_raw_terms():
     photo, entropy = (torch.tensor(v, requires_grad=True) for v in (2.0, 3.0))
-    loss, raw = total(
-        step_of(photo=photo, entropy=entropy), Objective({"photo": 1.0, "entropy": 0.25}).factors(0)
-    )
+    factors = Objective({"photo": 1.0, "entropy": 0.25}).factors(0)
+    loss, raw = total(step_of(photo=photo, entropy=entropy), factors)
     assert (loss.item(), raw) == (pytest.approx(2.75), {"photo": 2.0, "entropy": 3.0})
     assert not any(value.requires_grad for value in raw.values())
     loss.backward()

@@ -29,9 +29,8 @@ class Poison(lightning.Callback):
                 batch.observations[0].rgb[3, 1] = NAN
             if self.what == "slope":  # finite values whose gradient is not
                 terms_of, broken = method.terms_of, lambda state: (0 * state.flow.sum()).sqrt()
-                method.terms_of = lambda state, *given: (
-                    terms_of(state, *given) | {"tv_flow": lambda: broken(state)}
-                )
+                also = lambda state: {"tv_flow": lambda: broken(state)}  # noqa: E731
+                method.terms_of = lambda state, *given: terms_of(state, *given) | also(state)
             if self.what == "own gradients":  # as of a method that computes them itself
                 look, gradients = method.look, {"radiance.color": NAN * method.radiance.color.detach()}
                 method.look = lambda *given: replace(look(*given), gradients=gradients)

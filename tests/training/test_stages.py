@@ -14,16 +14,7 @@ import torch
 
 from forewarp.training import stages as stages_module
 from forewarp.training.checkpoints import KeepCheckpoint
-from tests.support.tiny_scene import (
-    EVERYTHING,
-    RATES,
-    Interrupt,
-    ball_data,
-    forward_model,
-    make_run,
-    same,
-    stage,
-)
+from tests.support import tiny_scene as tiny
 
 
 def stages(**changes):
@@ -33,16 +24,16 @@ def stages(**changes):
     """
     common = {"iterations": 10, "refresh_every": 4, "start": "hull", "hull_frames": 3, "hull_grow": 0.1}
     common["background_num_voxels"] = [[0, 8**3]]
-    coarse = stage("coarse", num_voxels=[[0, 10**3]], bases=[[0, 2], [0.5, 4]], **common)
+    coarse = tiny.stage("coarse", num_voxels=[[0, 10**3]], bases=[[0, 2], [0.5, 4]], **common)
     if "iterations" not in changes:
         changes |= {"iterations": 1000, "steps_per_picture": 10 / 12}
-    return [coarse, stage("fine", num_voxels=[[0, 11**3], [0.5, 14**3]], **(common | changes))]
+    return [coarse, tiny.stage("fine", num_voxels=[[0, 11**3], [0.5, 14**3]], **(common | changes))]
 
 
 def run(folder, callbacks=(), plan=None, **changes):
     """A run of the stages of ``plan``, or of ``stages(**changes)``, over small images."""
     plan = stages(**changes) if plan is None else plan
-    return make_run(folder, plan, data=ball_data(rays=64, size=16), callbacks=callbacks)
+    return tiny.make_run(folder, plan, data=tiny.ball_data(rays=64, size=16), callbacks=callbacks)
 
 
 @pytest.fixture(scope="module")
@@ -62,22 +53,23 @@ class Crash(lightning.Callback):
 
 def test_a_continued_run_equals_an_uninterrupted_one_to_the_bit(tmp_path, whole):
     """Ended at a last step, between stages, and before, while and after the lattice grows."""
-    for interruption in (Interrupt("coarse", 9), Crash(), *(Interrupt("fine", step) for step in (3, 5, 7))):
+    fine = [tiny.Interrupt("fine", step) for step in (3, 5, 7)]
+    for interruption in (tiny.Interrupt("coarse", 9), Crash(), *fine):
         with pytest.raises(SystemExit):
             run(tmp_path, [interruption]).fit()
-    assert same(run(tmp_path).fit(), whole[1])
+    assert tiny.same(run(tmp_path).fit(), whole[1])
 
 
 def test_a_finished_run_is_loaded_and_one_that_was_not_noted_only_noted(tmp_path, whole):
     shutil.copytree(whole[0], tmp_path, dirs_exist_ok=True)
     before = {p: p.stat().st_mtime_ns for p in tmp_path.rglob("*") if p.is_file()}
-    assert same(run(tmp_path, [Crash()]).fit(), whole[1])
-    assert same(run(tmp_path).load(), whole[1])
+    assert tiny.same(run(tmp_path, [Crash()]).fit(), whole[1])
+    assert tiny.same(run(tmp_path).load(), whole[1])
     assert before == {p: p.stat().st_mtime_ns for p in tmp_path.rglob("*") if p.is_file()}
     (tmp_path / "fine" / "done.json").unlink()
     with pytest.raises(ValueError, match="fine: expected a finished stage, but got none; continue with"):
         run(tmp_path).load()
-    assert same(run(tmp_path).fit(), whole[1])
+    assert tiny.same(run(tmp_path).fit(), whole[1])
     assert run(tmp_path).finished()["fine"]["steps"] == 10
 
 
@@ -106,7 +98,7 @@ def test_what_a_run_leaves(whole):
 )
 def test_a_mistake_in_a_later_stage_is_refused_before_anything_is_trained(tmp_path, wrong, text):
     with pytest.raises((TypeError, ValueError), match=text):
-        run(tmp_path, plan=[stage("coarse"), stage("fine", **wrong)]).fit()
+        run(tmp_path, plan=[tiny.stage("coarse"), tiny.stage("fine", **wrong)]).fit()
     assert not (tmp_path / "coarse" / "last.ckpt").exists()
 
 
@@ -145,9 +137,7 @@ def test_times_come_in_by_steps_and_what_a_short_stage_leaves_out_is_told(tmp_pa
     ours.fit()
     assert [step[-1] for step in diary.steps if step[0] == "fine"] == [2, 2, 2, 3, 3, 3, 4, 4, 4, 5]
     (line,) = told
-    assert line.startswith(
-        "fine: ended when 5 of 12 training images had come in; for all, set a larger budget,"
-    )
+    assert line.startswith("fine: ended when 5 of 12 training images had come in; for all, set a larger bu")
     assert line.endswith(" or stage.fine.curriculum.iterations_per_time=null")
 
 
@@ -193,7 +183,7 @@ def test_every_stage_counts_its_own_memory(tmp_path, monkeypatch):
     order = []
     monkeypatch.setattr(stages_module, "reset_peak_memory", lambda: order.append("reset"))
     monkeypatch.setattr(stages_module, "peak_memory_bytes", lambda: order.append("peak") or 7)
-    ours = run(tmp_path, plan=[stage("coarse", iterations=2), stage("fine", iterations=2)])
+    ours = run(tmp_path, plan=[tiny.stage("coarse", iterations=2), tiny.stage("fine", iterations=2)])
     ours.fit()
     ours.fit()  # all is finished
     assert order == ["reset", "peak"] * 2
@@ -201,19 +191,19 @@ def test_every_stage_counts_its_own_memory(tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("choices", [{"motion": None, "trajectory": None}, EVERYTHING], ids=["static", "all"])
+@pytest.mark.parametrize("choices", [{"motion": None, "trajectory": None}, tiny.EVERYTHING])
 def test_the_least_and_the_whole_model_train_carry_and_load(tmp_path, choices):
-    data, model = ball_data(rays=64, size=16), forward_model(**choices)
-    ours = make_run(tmp_path, stages(iterations=4), data=data, model=model)
+    data, model = tiny.ball_data(rays=64, size=16), tiny.forward_model(**choices)
+    ours = tiny.make_run(tmp_path, stages(iterations=4), data=data, model=model)
     module = ours.fit()
     assert all(p.isfinite().all() for p in module.parameters())
-    assert same(ours.load(), module)
+    assert tiny.same(ours.load(), module)
 
 
 def test_a_scene_of_one_time_needs_no_motion_and_no_rate_for_it(tmp_path):
-    rates = {name: rate for name, rate in RATES.items() if name != "flow"}
-    still = [stage(iterations=4, lr=rates)]
-    module = make_run(tmp_path, still, data=ball_data(rays=64, size=16, times=[0.0] * 4)).fit()
+    rates = {name: rate for name, rate in tiny.RATES.items() if name != "flow"}
+    still = [tiny.stage(iterations=4, lr=rates)]
+    module = tiny.make_run(tmp_path, still, data=tiny.ball_data(rays=64, size=16, times=[0.0] * 4)).fit()
     assert module.method.motion is None
 
 
@@ -257,7 +247,7 @@ def test_ctrl_c_keeps_the_step_that_it_met(tmp_path, whole, capsys, name, step):
     assert "ends this step and saves it; Ctrl-C again stops at once" in capsys.readouterr().err
     ours, told = run(tmp_path), []
     ours.tell = told.append
-    assert same(ours.fit(), whole[1])
+    assert tiny.same(ours.fit(), whole[1])
     before = ["coarse: finished before"] if name == "fine" else []
     assert told == [*before, f"{name}: goes on at {10 * (step + 1)}%, step {step + 1}", ENDED]
 
@@ -276,14 +266,14 @@ def test_ctrl_c_that_no_step_follows_stops_before_the_next_stage(tmp_path, whole
         run(tmp_path, [AtTheEnd()]).fit()
     assert (tmp_path / "coarse" / "done.json").is_file()
     assert not (tmp_path / "fine").exists()
-    assert same(run(tmp_path).fit(), whole[1])
+    assert tiny.same(run(tmp_path).fit(), whole[1])
 
 
 def test_whoever_sees_to_signals_himself_is_left_alone(tmp_path):
     def handler(number, frame):
         pass
 
-    keeper = KeepCheckpoint(tmp_path / "last.ckpt", 60)
+    keeper = KeepCheckpoint(tmp_path / "last.ckpt", 60, print)
     before = signal.signal(signal.SIGINT, handler)
     try:
         with keeper.listening():

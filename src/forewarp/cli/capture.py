@@ -36,9 +36,12 @@ After Ctrl-C the same command goes on.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import importlib.util
+from pathlib import Path
 
 from forewarp.cli.entry import command
+from forewarp.data.files import MARKERS, whole
+from forewarp.files import check_replaceable
 from forewarp.runs.config import check_seed
 from forewarp.runs.overrides import command_line, text_override
 
@@ -55,27 +58,20 @@ def capture(config) -> None:
     """Make a scene, and say what was found."""
     from omegaconf import OmegaConf
 
-    source, out = check(config)
-    # These load torch; mistakes have been answered before.
-    from forewarp.capture import rig, scene
+    source, out = check(config)  # what follows loads torch; mistakes have been answered before
+    from forewarp.capture import record3d, rig, scene
     from forewarp.capture.frames import Source
-    from forewarp.capture.pipeline import capture
+    from forewarp.capture.pipeline import ABOUT, PICTURE, capture
     from forewarp.capture.poses import Search
     from forewarp.progress import Counted
 
-    if type(config.force) is not bool:
-        raise ValueError(f"force: expected true or false, but got {config.force}")
-    if is_scan(source["video"]):
-        from forewarp.capture import record3d
-        from forewarp.capture.pipeline import ABOUT
-
-        facts = record3d.capture_record3d(source["video"], out, Counted, ABOUT, config.frames)
-        tell(record3d.summary(facts), out)
-        return
     search = Search(config.matching, config.lens, config.features, config.seed, config.threads)
     options = {"frames": config.frames, "size": config.size, "force": config.force}
     videos, held = source.pop("videos"), []
-    if videos is None:
+    if is_scan(source["video"]):
+        facts = record3d.capture_record3d(source["video"], out, Counted, ABOUT, config.frames)
+        lines = record3d.summary(facts)
+    elif videos is None:
         facts = capture(Source(**source), out, search, Counted, **options)
         lines = scene.summary(facts)
     else:
@@ -85,17 +81,8 @@ def capture(config) -> None:
         # One in the middle, as the outermost see what no other does.
         one = text_override("data.test_cameras", posed[len(posed) // 2]).partition("=")[2]
         held = [f"data.test_cameras=[{one}]"] if len(posed) >= LEAST_HELD else []
-    tell(lines, out, held)
-
-
-def tell(lines: list[str], out, held: Sequence[str] = ()) -> None:
-    """Print what was found, where it is, and the command that comes next."""
-    from forewarp.capture.pipeline import PICTURE
-
-    for line in lines:
-        print(line)
     drawn = out / PICTURE
-    print(f"written: {out}" + (f"; see {drawn}" if drawn.is_file() else ""))
+    print(*lines, f"written: {out}" + (f"; see {drawn}" if drawn.is_file() else ""), sep="\n")
     where = [text_override("data.root", str(out.parent)), text_override("data.scene", out.name), *held]
     print(f"next: {command_line('train', ['experiment=video_with_poses', *where])}")
 
@@ -107,12 +94,6 @@ def is_scan(video) -> bool:
 
 def check(config) -> tuple[dict, object]:
     """Refuse settings that cannot work, before anything is loaded; return what to capture, and where to."""
-    from importlib.util import find_spec
-    from pathlib import Path
-
-    from forewarp.data.files import MARKERS
-    from forewarp.files import check_replaceable
-
     source = {key: None if config[key] is None else Path(config[key]) for key in PATHS if key != "out"}
     video, videos, images = source["video"], source["videos"], source["images"]
     given = [key for key in ("video", "videos", "images") if source[key] is not None]
@@ -120,32 +101,26 @@ def check(config) -> tuple[dict, object]:
         got = " and ".join(given) or "none"
         expected = "expected video=FILE, videos=FOLDER or images=FOLDER"
         raise ValueError(f"video, videos, images: {expected}, but got {got}; set one of them")
-    if images is None and source["colmap"] is not None:
-        raise ValueError(f"colmap: expected images=FOLDER beside it, but got {given[0]}=; set images=")
-    if typed := [key for key, value in RIG.items() if videos is None and config[key] != value]:
-        raise ValueError(f"{typed[0]}: expected videos=FOLDER beside it, but got {given[0]}=; remove it")
-    if type(config.fixed) not in (bool, type(None)):
-        raise ValueError(f"fixed: expected true, false or null, but got {config.fixed}")
+    needs = {"colmap": "images"} if source["colmap"] is not None else {}
+    needs |= {key: "videos" for key, value in RIG.items() if config[key] != value}
+    for key, needed in needs.items():
+        if needed != given[0]:
+            raise ValueError(f"{key}: expected {needed}=FOLDER beside it, but got {given[0]}=; remove it")
+    for key, nothing in (("force", bool), ("fixed", type(None))):
+        if type(config[key]) not in (bool, nothing):
+            raise ValueError(f"{key}: expected true or false, but got {config[key]}")
     if config.rate is not None and not (type(config.rate) in (int, float) and 0 < config.rate < 1e6):
         raise ValueError(f"rate: expected pictures a second, above 0, but got {config.rate}")
-    if isinstance(config.without, str):
-        raise ValueError(
-            f"without: expected a list of names, but got {config.without}; write without=[{config.without}]"
-        )
+    if isinstance(name := config.without, str):
+        raise ValueError(f"without: expected a list of names, but got {name}; write without=[{name}]")
     for key, path in source.items():
         what, there = ("file", Path.is_file) if key == "video" else ("folder", Path.is_dir)
         if path is not None and not there(path):
             got = "another thing" if path.exists() else "none"
             raise ValueError(f"{key}: expected an existing {what}, but got {got}: {path}; set {key}=...")
-    for key, least, or_null in (
-        ("frames", 3, True),
-        ("size", 64, True),
-        ("features", 100, False),
-        ("threads", 1, True),
-    ):
-        value = config[key]
-        if not (or_null and value is None) and (type(value) is not int or value < least):
-            raise ValueError(f"{key}: expected a whole number of at least {least}, but got {value}")
+    for key, least in (("frames", 3), ("size", 64), ("features", 100), ("threads", 1)):
+        if config[key] is not None or key == "features":
+            whole(config[key], key, least)
     check_seed(config.seed)
     for key, known in (("matching", MATCHING), ("lens", LENSES)):
         if config[key] not in known:
@@ -153,21 +128,17 @@ def check(config) -> tuple[dict, object]:
     if typed := [key for key in ("masks", "colmap") if is_scan(video) and source[key] is not None]:
         raise ValueError(f"{typed[0]}: expected none beside a scan of Record3D, but got one; remove it")
     for package in ("pycolmap", "cv2", *(["lzfse"] if is_scan(video) else [])):
-        if find_spec(package) is None:
+        if importlib.util.find_spec(package) is None:
             raise ImportError(f"capture: expected {package}, but got none; install forewarp[capture]")
     out = Path(config.out or Path("captures") / (video or videos or images).resolve().stem)
     if Path.cwd().is_relative_to(out.resolve()):
         raise ValueError(f"out: expected a folder to be made, but got {out}, which you are in; name another")
     for key, path in source.items():
         place, ours = out.resolve(), path and path.resolve()
-        if ours and ours.is_relative_to(place):
-            raise ValueError(
-                f"out: expected a folder that holds no inputs, but got {out} with {key}={path}; set out=..."
-            )
-        if ours and key in ("videos", "images", "masks") and place.is_relative_to(ours):
-            raise ValueError(
-                f"out: expected a folder outside {key}={path}, which is read, but got {out}; set out=..."
-            )
+        inside = key in ("videos", "images", "masks") and ours and place.is_relative_to(ours)
+        if inside or (ours and ours.is_relative_to(place)):
+            expected = f"out: expected a folder neither in one that is read nor around one, but got {out}"
+            raise ValueError(f"{expected} with {key}={path}; set out=...")
     if (out / MARKERS["posed_video"]).exists() and not config.overwrite:
         raise ValueError(f"{out}: expected a new folder, but got a scene; set overwrite=true or out=...")
     check_replaceable(out, "capture.json")

@@ -142,7 +142,6 @@ def _run(name: str, task: Callable, conf: Path, config_name: str) -> list[int]:
     typed_once = {key_of(word) for word in sys.argv[1:] if not word.startswith("-") and not is_sweep(word)}
 
     def job(config) -> object:
-        # Caught here, as Hydra would print a message of its own.
         status, result = 0, None
         try:
             quiet()  # again, as a launcher may start another process
@@ -150,7 +149,7 @@ def _run(name: str, task: Callable, conf: Path, config_name: str) -> list[int]:
             overrides.constant.clear()  # of an earlier sweep of this process
             overrides.constant.update(typed_once)
             result = task(config)
-        except Exception as error:
+        except Exception as error:  # caught here, as Hydra would print a message of its own
             status = _tell(name, error, config_name)
         score = result if isinstance(result, int | float) else None
         found = [None, None] if status else [str(config.get("run")), config.get("score")]
@@ -161,12 +160,12 @@ def _run(name: str, task: Callable, conf: Path, config_name: str) -> list[int]:
 
     # In a file, as jobs may be other processes; those of other machines do not reach it.
     with tempfile.TemporaryDirectory(prefix="forewarp-") as folder:
-        ended = os.path.join(folder, "ended")
+        ended = Path(folder) / "ended"
+        ended.touch()
         try:
             hydra.main(version_base="1.3", config_path=str(conf), config_name=config_name)(job)()
         finally:  # a sweeper may fail, too
-            lines = Path(ended).read_text().splitlines() if os.path.exists(ended) else []
-            jobs = [json.loads(line) for line in lines]
+            jobs = [json.loads(line) for line in ended.read_text().splitlines()]
             if len(jobs) > 1:
                 _tell_jobs(name, jobs)
     return [status for status, *_ in jobs]
@@ -186,8 +185,8 @@ def _tell_jobs(name: str, jobs: list[tuple[int, str, str | None, str | None, flo
             print(line)
         sys.stdout.flush()
     if failed:
-        listed = "".join(f"\n  {words}" for words in failed)
-        print(f"forewarp-{name}: {len(failed)} of {len(jobs)} jobs failed:{listed}", file=sys.stderr)
+        about = f"forewarp-{name}: {len(failed)} of {len(jobs)} jobs failed:"
+        print(about, *failed, sep="\n  ", file=sys.stderr)
 
 
 def _tell(name: str, error: Exception, config_name: str) -> int:
@@ -195,7 +194,8 @@ def _tell(name: str, error: Exception, config_name: str) -> int:
     line = unknown_key(error, config_name, sys.argv[1:]) or one_line(error)
     if line is None or os.environ.get(TRACEBACK_VARIABLE) == "1":
         traceback.print_exception(error)
-    print(f"forewarp-{name}: error: {line or _bug(error)}", file=sys.stderr)
+    bug = f"{type(error).__name__}: {flat(str(error))}; this is a bug, please report it"
+    print(f"forewarp-{name}: error: {line or bug}", file=sys.stderr)
     return 1 if line is None else MISTAKE
 
 
@@ -203,10 +203,6 @@ def _interrupted(name: str) -> None:
     say = "run the same command again" + (" to go on from the last checkpoint" if name == "train" else "")
     print(f"\nforewarp-{name}: interrupted; {say}", file=sys.stderr)
     sys.exit(INTERRUPTED)
-
-
-def _bug(error: Exception) -> str:
-    return f"{type(error).__name__}: {flat(str(error))}; this is a bug, please report it"
 
 
 def choices(conf: Path, name: str) -> str:
@@ -224,8 +220,6 @@ def choices(conf: Path, name: str) -> str:
         text = (conf / f"{name}.yaml").read_text()
         groups = {group: groups[group] for group in ("dataset", "trainer") if f"- {group}:" in text}
     lines = [f"  {group:<17} {' | '.join(groups[group])}" for group in sorted(groups) if groups[group]]
-    more = [
-        "Every other key: --cfg job prints them all; key=value sets one.",
-        "Where options come from: --info defaults-tree or searchpath. Hydra's own options: --hydra-help.",
-    ]
+    more = ["Every other key: --cfg job prints them all; key=value sets one."]
+    more.append("Where options come from: --info defaults-tree or searchpath. Hydra's own: --hydra-help.")
     return "\n".join((["Choices (group=option):", *lines, ""] if lines else []) + more)

@@ -30,8 +30,7 @@ def evaluate(config) -> None:
     refuse_numbers(config, "views", "sheets", "reduce")
     saved = saved_config(config.run, config)
     saved.views, saved.reduce = config.views, config.reduce  # not those of the run: null is all, and whole
-    behind = config.eval_background
-    if behind is not None:
+    if (behind := config.eval_background) is not None:
         saved.data.eval_background = behind
     # These load torch; mistakes have been answered before.
     from forewarp.runs.build import build_run
@@ -44,10 +43,8 @@ def evaluate(config) -> None:
         module = run.load().to(place)
         warn_if_changed(run)
         if behind is not None and not run.datamodule.scene.has_alpha:
-            raise ValueError(
-                f"eval_background: expected a run on cut-out images, but got {behind} for images that are "
-                "opaque and have no background; leave it out"
-            )
+            expected = "eval_background: expected a run on cut-out images, as opaque ones have no background"
+            raise ValueError(f"{expected}, but got {behind}; leave it out")
         measure_run(run, module, saved)
 
 

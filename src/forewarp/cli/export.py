@@ -32,23 +32,14 @@ What one types most:
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from dataclasses import replace
+from pathlib import Path
 
 from forewarp.cli.entry import command
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from forewarp.export.tracks import Source
-    from forewarp.training.module import DynamicSceneModule
-    from forewarp.training.stages import Run
 
 
 def export(config) -> None:
     """Load a run, or those of a film's windows, and write it."""
-    from dataclasses import replace
-    from pathlib import Path
-
     from forewarp.export.formats import ABOUT, FORMATS, write
     from forewarp.files import check_replaceable
 
@@ -78,28 +69,26 @@ def export(config) -> None:
 
 def saved_runs(config) -> list:
     """Return the config of the run, or those of the windows in a folder of them, in their order."""
-    from pathlib import Path
-
     from forewarp.runs.config import saved_config
     from forewarp.runs.windows import check_film
 
-    inner = [] if config.run is None else sorted(Path(config.run).glob("*/config.yaml"))
-    if not inner or (Path(config.run) / "config.yaml").is_file():
+    folder = Path(config.run or "")
+    inner = sorted(folder.glob("*/config.yaml"))
+    if config.run is None or not inner or (folder / "config.yaml").is_file():
         return [saved_config(config.run, config)]
     found = [saved_config(str(place.parent), config) for place in inner]
     windows = sorted((one for one in found if one.data.get("window")), key=lambda one: one.data.window[0])
-    check_film([tuple(one.data.window) for one in windows], Path(config.run))
+    check_film([tuple(one.data.window) for one in windows], folder)
     return windows
 
 
-def source_of(run: Run, module: DynamicSceneModule, model: str, times: Sequence[float]) -> Source:
-    """Return what exports begin with: a fitted ``module`` of a run, a ``model`` by its config, at times."""
+def source_of(run, module, model: str, times: list[float]):
+    """Return the ``Source`` of exports: a fitted ``module`` of a run, a ``model`` by its config, at times."""
     from forewarp.export.tracks import Source
 
-    frames = run.datamodule.scene.train
-    cameras, taken = [frame.camera for frame in frames], [frame.time for frame in frames]
-    background = tuple(run.datamodule.targets("train").background.tolist())
     scene = run.datamodule.scene
+    cameras, taken = [frame.camera for frame in scene.train], [frame.time for frame in scene.train]
+    background = tuple(run.datamodule.targets("train").background.tolist())
     place = tuple(scene.protocol.get("span", (0.0, 1.0))), scene.protocol.get("window", [0.0])[0]
     return Source(module, model, cameras, times, background, scene.name, taken, *place)
 
@@ -116,9 +105,8 @@ def summary(about: dict) -> str:
     amount = f"{size / 1e6:.1f} MB" if size >= 1e5 else f"{size / 1e3:.0f} kB"
     text = f"{count} file{'s' * (count != 1)}, {amount}"
     for what in {"particles", "points", "vertices"} & about.keys():
-        number = about[what]
-        in_each_file = isinstance(number, list)
-        text += f", at least {min(number):,} {what} each" if in_each_file else f", {number:,} {what}"
+        of_files = isinstance(about[what], list)
+        text += f", at least {min(about[what]):,} {what} each" if of_files else f", {about[what]:,} {what}"
     return text
 
 
@@ -136,34 +124,28 @@ def check(config, windows: int = 1) -> list[float]:
 
     if config.format not in FORMATS:
         raise ValueError(f"format: expected one of {', '.join(FORMATS)}, but got '{config.format}'")
-    if windows > 1 and FORMATS[config.format].times:
-        raise ValueError(
-            f"format: expected glb or html for a film's windows, but got {config.format}; export one of them"
-        )
-    options = FORMATS[config.format].options
-    foreign = {option for form in FORMATS.values() for option in form.options} - set(options)
+    form, name = FORMATS[config.format], f"format={config.format}"
+    if windows > 1 and form.times:
+        raise ValueError(f"format: expected glb or html for a film's windows, but got {name}; export one")
+    foreign = {option for other in FORMATS.values() for option in other.options} - set(form.options)
     for key in map(key_of, typed_overrides()):
-        if key == "times" and not FORMATS[config.format].times:
-            raise ValueError(
-                f"times: expected none with format={config.format}, which holds all times; leave it out"
-            )
+        if key == "times" and not form.times:
+            raise ValueError(f"times: expected none with {name}, which holds all times; leave it out")
         if key in foreign:
-            raise ValueError(
-                f"{key}: expected an option of format={config.format} ({', '.join(options)}); leave it out"
-            )
+            raise ValueError(f"{key}: expected an option of {name} ({', '.join(form.options)}); leave it out")
     require(config.format)
-    for key in ("layer", *options):
+    for key in ("layer", *form.options):
         check_option(key, config[key])
     times = config.times
-    if isinstance(times, ListConfig):
-        if not times or not all(type(time) in (int, float) and 0 <= time <= 1 for time in times):
-            raise ValueError(f"times: expected numbers in [0, 1], but got {list(times)}")
-        if sorted(set(times)) != list(times):
-            raise ValueError(f"times: expected each later than the one before, but got {list(times)}")
-        return [float(time) for time in times]
-    if type(times) is not int or times < 1:
-        raise ValueError(f"times: expected a whole number of at least 1, or a list, but got {times}")
-    return [i / max(times - 1, 1) for i in range(times)]
+    if not isinstance(times, ListConfig):
+        if type(times) is not int or times < 1:
+            raise ValueError(f"times: expected a whole number of at least 1, or a list, but got {times}")
+        return [i / max(times - 1, 1) for i in range(times)]
+    numbers = bool(times) and all(type(time) in (int, float) and 0 <= time <= 1 for time in times)
+    if not numbers or sorted(set(times)) != list(times):
+        wanted = "numbers in [0, 1], each later than the one before"
+        raise ValueError(f"times: expected {wanted}, but got {list(times)}")
+    return [float(time) for time in times]
 
 
 def main() -> None:

@@ -13,17 +13,9 @@ from forewarp.runs.config_files import configurations, installed
 from forewarp.runs.overrides import key_of
 
 OF_METHODS = ("model", "modules", "objective", "preset", "stage")  # what methods have keys of their own in
-# Hydra's own, which begin with dashes.
-OPTIONS = "help hydra-help version cfg resolve package run multirun shell-completion config-path config-name"
-OPTIONS = (*OPTIONS.split(), "config-dir", "experimental-rerun", "info")
-VALUED = (
-    "cfg",
-    "package",
-    "config-path",
-    "config-name",
-    "config-dir",
-    "experimental-rerun",
-)  # a word follows
+# Hydra's own, which begin with dashes; after those of ``VALUED`` a word follows.
+VALUED = ("cfg", "package", "config-path", "config-name", "config-dir", "experimental-rerun")
+OPTIONS = (*VALUED, "help", "hydra-help", "version", "resolve", "run", "multirun", "shell-completion", "info")
 VALUED = {*(f"--{option}" for option in VALUED), "-c", "-p", "-cp", "-cn", "-cd"}
 FOLDERS = {"evaluate": "run", "render": "run", "view": "run", "export": "run", "train": "resume"}
 
@@ -36,18 +28,15 @@ def with_run_key(name: str, arguments: list[str]) -> list[str]:
         name: name of the command.
         arguments: arguments of the command line.
     """
-    key, before = FOLDERS.get(name), ["", *arguments]
-    reads_as_override = re.compile(r"[~+]|[^/]*=")
-    bare = [
-        key
-        and one
-        and not one.startswith("-")
-        and not before[i].startswith("-")
-        and not reads_as_override.match(one)
-        and Path(one).is_dir()
-        for i, one in enumerate(arguments)
-    ]
-    return [f"{key}={one}" if is_bare else one for is_bare, one in zip(bare, arguments)]
+    if (key := FOLDERS.get(name)) is None:
+        return arguments
+
+    def is_bare(word: str, before: str) -> bool:
+        is_other = re.match("$|[-~+]|[^/]*=", word) is not None  # nothing, an option or an override
+        return not is_other and before[:1] != "-" and Path(word).is_dir()
+
+    pairs = zip(arguments, ["", *arguments])
+    return [f"{key}={word}" if is_bare(word, before) else word for word, before in pairs]
 
 
 def refuse_dashes(arguments: list[str]) -> None:
@@ -61,12 +50,10 @@ def refuse_dashes(arguments: list[str]) -> None:
         if argument.startswith("--") and key not in OPTIONS:
             follows = arguments[at + 1] if not value and at + 1 < len(arguments) else ""
             value = value or ("" if "=" in follows or follows[:1] == "-" else follows)
-            near = [] if value else difflib.get_close_matches(key, OPTIONS, 1, cutoff=0.75)
-            if near:
-                got = f"expected an option of Hydra's, but got none of this name; did you mean --{near[0]}?"
-                raise ValueError(f"{argument}: {got}")
-            typed = f"{key}={value or 'VALUE'}"
-            raise ValueError(f"{argument}: expected options without dashes; type {typed}")
+            says = f"expected options without dashes; type {key}={value or 'VALUE'}"
+            if not value and (near := difflib.get_close_matches(key, OPTIONS, 1, cutoff=0.75)):
+                says = f"expected an option of Hydra's, but got none of this name; did you mean --{near[0]}?"
+            raise ValueError(f"{argument}: {says}")
 
 
 def options_last(arguments: list[str]) -> list[str]:
@@ -75,13 +62,11 @@ def options_last(arguments: list[str]) -> list[str]:
     >>> options_last(["model=nerf", "--cfg", "job", "--multirun", "seed=0,1", "--info", "~stage.fine"])
     ['model=nerf', 'seed=0,1', '~stage.fine', '--cfg', 'job', '--multirun', '--info']
     """
-    before = ["", *arguments]
-    follows = [
-        before[i] in VALUED or (before[i] in ("--info", "-i") and re.fullmatch("[a-z-]+", one) is not None)
-        for i, one in enumerate(arguments)
-    ]
-    is_option = [is_value or one.startswith("-") for is_value, one in zip(follows, arguments)]
-    return [one for last in (False, True) for one, is_last in zip(arguments, is_option) if is_last == last]
+    overrides, options = [], []
+    for word, before in zip(arguments, ["", *arguments]):
+        follows = before in VALUED or (before in ("--info", "-i") and re.fullmatch("[a-z-]+", word))
+        (options if follows or word.startswith("-") else overrides).append(word)
+    return overrides + options
 
 
 def unknown_key(error: Exception, name: str, arguments: list[str]) -> str | None:
@@ -114,14 +99,17 @@ def unknown_key(error: Exception, name: str, arguments: list[str]) -> str | None
         for model in ("forward", "particles"):
             of_model = [*(one for one in others if key_of(one) != "model"), f"model={model}"]
             if key.replace("/", ".") in _every_key(_composed(name, of_model)):
-                return (
-                    f"{key}: expected an option of model={config.model.name}, but got one of model={model}; "
-                    f"add model={model}, or leave it out"
-                )
+                return of_another(key, config.model.name, model)
     groups = option_groups(configurations(), *installed().values())
     near = difflib.get_close_matches(key, [*keys, *groups], 1, cutoff=0.8)
     advice = f"did you mean {near[0]}?" if near else f"forewarp-{name} --cfg job prints all keys"
     return f"{key}: expected a key of the configuration, but got none of this name; {advice}"
+
+
+def of_another(option: str, model: str, owner: str) -> str:
+    """Return the line for an option that the chosen method has not, but ``owner`` has."""
+    expected = f"expected an option of model={model}, but got one of model={owner}"
+    return f"{option}: {expected}; add model={owner}, or leave it out"
 
 
 def _composed(name: str, arguments: list[str]):
@@ -176,45 +164,23 @@ def one_line(error: BaseException) -> str | None:
         return f"{missing[1]}: expected a value, but got none; set {missing[1]}=..."
     if getattr(error, "override", None):  # Hydra could not parse it
         return f"{error.override}: {flat(str(error))}"
-    absent = re.search(r"hydra/(launcher|sweeper)[/'=:\s]+(joblib|ray|submitit_\w+|optuna)", str(error))
-    if isinstance(error, HydraException) and absent:
-        kind, plugin = absent.groups()
-        otherwise = ", or use launcher=local" if kind == "launcher" else ""
-        expected = f"{kind}: expected the package of hydra/{kind}={plugin}, but got none"
-        return f"{expected}; install forewarp[sweeps]{otherwise}"
-    trainer = re.search(r"Could not find 'trainer/([^']+)'", str(error))
-    if isinstance(error, HydraException) and trainer:
-        from forewarp.runs.config import instead_of
-
-        return f"trainer: expected auto, cpu or gpu, but got {trainer[1]}; {instead_of(trainer[1])}"
-    several = re.match(r"Ambiguous value for argument '([^=]+)=(.*)'", str(error))
-    if several and isinstance(error, HydraException):
-        key, value = several.groups()
-        return (
-            f"{key}: expected one value, but got {value}, which reads as several; add --multirun for a job "
-            f"of each, or type a name that has a comma as \"{key}='{value}'\""
-        )
-    absent = re.search(r"Could not (?:find|load) '([\w/]+)/([^'/]+)'", str(error))
-    if isinstance(error, HydraException) and absent:
-        said = str(error).split("Config search path")[0]
-        return flat(said) + _nearest_option(*absent.groups(), said)
+    if isinstance(error, HydraException) and (line := _of_hydra(str(error))):
+        return line
     if isinstance(error, HydraException | OmegaConfBaseException):
         cause = error.__cause__
         detail = f" ({flat(str(cause))})" if isinstance(cause, OmegaConfBaseException) else ""
         return flat(str(error).split("Config search path")[0]) + detail
     if isinstance(error, OSError):
-        return _of_system(error)
-    if (
-        isinstance(error, MemoryError)
-        or "can't allocate memory" in str(error)
-        or "out of memory" in str(error)
-    ):
+        expected, advice = "a usable file or folder", "check that it exists and may be written"
+        if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
+            expected, advice = "room to write", "free some room and run the same command again"
+        got = error.strerror or str(error)
+        return f"{error.filename or 'a file'}: expected {expected}, but got {got}; {advice}"
+    if isinstance(error, MemoryError) or re.search("can't allocate memory|out of memory", str(error)):
         wanted = re.search(r"allocate (\d+ bytes|[\d.]+ .iB)", str(error))
-        return (
-            f"memory: expected room for {wanted[1] if wanted else 'more'}, but got none; lower "
-            "stage.*.density, or with model=forward data.rays or stage.*.num_voxels, and run the same "
-            "command again"
-        )
+        advice = "lower stage.*.density, or with model=forward data.rays or stage.*.num_voxels, and run the "
+        advice += "same command again"
+        return f"memory: expected room for {wanted[1] if wanted else 'more'}, but got none; {advice}"
     if isinstance(error, TypeError) and "unexpected keyword argument" in str(error):
         return f"config: {error}; leave that key out"
     if isinstance(error, ImportError):
@@ -222,18 +188,31 @@ def one_line(error: BaseException) -> str | None:
     return flat(str(error)) if isinstance(error, ValueError) else None
 
 
-def _nearest_option(group: str, word: str, said: str) -> str:
-    """Return the end of a line about an option that there is not: the options, if ``said`` has none of them,
-    and the one of the nearest name.
-    """
+def _of_hydra(said: str) -> str | None:
+    """Return the line for what Hydra says of an option that there is not, or of several values; else None."""
+    if absent := re.search(r"hydra/(launcher|sweeper)[/'=:\s]+(joblib|ray|submitit_\w+|optuna)", said):
+        kind, plugin = absent.groups()
+        otherwise = ", or use launcher=local" if kind == "launcher" else ""
+        expected = f"{kind}: expected the package of hydra/{kind}={plugin}, but got none"
+        return f"{expected}; install forewarp[sweeps]{otherwise}"
+    if several := re.match(r"Ambiguous value for argument '([^=]+)=(.*)'", said):
+        key, value = several.groups()
+        advice = f"add --multirun for a job of each, or type a name that has a comma as \"{key}='{value}'\""
+        return f"{key}: expected one value, but got {value}, which reads as several; {advice}"
+    if not (absent := re.search(r"Could not (?:find|load) '([\w/]+)/([^'/]+)'", said)):
+        return None
+    group, word = absent.groups()
+    if group == "trainer":
+        from forewarp.runs.config import instead_of
+
+        return f"trainer: expected auto, cpu or gpu, but got {word}; {instead_of(word)}"
     from forewarp.runs.sections import option_groups
 
+    said = said.split("Config search path")[0]
     known = option_groups(configurations(), *installed().values()).get(group, [])
-    listed = (
-        f" Available options in '{group}': {'; '.join(known)}" if known and "Available" not in said else ""
-    )
+    listed = f" Available options in '{group}': {'; '.join(known)}" if "Available" not in said else ""
     near = difflib.get_close_matches(word, [*known, *re.findall(r"^\t(\S+)$", said, re.M)], 1)
-    return listed + (f"; did you mean {near[0]}?" if near else "")
+    return flat(said) + listed * bool(known) + (f"; did you mean {near[0]}?" if near else "")
 
 
 def _to_install(error: ImportError) -> str:
@@ -242,16 +221,6 @@ def _to_install(error: ImportError) -> str:
     if error.name is None or error.name.partition(".")[0] in ours:
         return "; install it with make install"
     return f"; install {error.name.partition('.')[0]}, or put its folder on PYTHONPATH"
-
-
-def _of_system(error: OSError) -> str:
-    reason, file = error.strerror or str(error), error.filename
-    full = error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-    advice = (
-        "free some room and run the same command again" if full else "check that it exists and may be written"
-    )
-    expected = "room to write" if full else "a usable file or folder"
-    return f"{file or 'a file'}: expected {expected}, but got {reason}; {advice}"
 
 
 def flat(text: str) -> str:

@@ -24,10 +24,8 @@ def plan(config) -> None:
     from forewarp.planning.plan_file import show_plan
     from forewarp.runs.overrides import typed_overrides
 
-    if isinstance(config.plan, str):
-        raise ValueError(
-            f"plan: expected keys as plan.folder=FOLDER, but got {config.plan}; forewarp-train takes a file"
-        )
+    if isinstance(file := config.plan, str):
+        raise ValueError(f"plan: expected plan.folder=FOLDER, but got {file}; forewarp-train takes a file")
     refuse_all(config)
     refuse_missing_scene(config)
     from forewarp.planning.plan import make_plan  # loads torch; mistakes have been answered before

@@ -12,28 +12,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from hydra.core.hydra_config import HydraConfig
-from hydra.types import RunMode
 from omegaconf import DictConfig
 
+from forewarp.cli.mistakes import of_another
 from forewarp.cli.view import require_viewer
-from forewarp.data.files import scene_folder
+from forewarp.data.files import MARKERS, number, scene_folder, whole
 from forewarp.files import MOST_CONFIG, read_text, replace_file
-from forewarp.runs.config import check_planned, check_values, hashed, resumed, trust_of
+from forewarp.runs.config import check_planned, check_values, hashed, is_swept, resumed, trust_of
 from forewarp.runs.overrides import key_of, typed_overrides
 
 if TYPE_CHECKING:  # loads torch
     from forewarp.runs.fitted import Score
     from forewarp.training.stages import Run
-
-# Data modules that are not listed, such as those that make their scene, check for themselves.
-READERS = {
-    "forewarp.data.module.DNeRFDataModule": "dnerf",
-    "forewarp.data.module.LegoCompleteDataModule": "lego_complete",
-    "forewarp.data.module.HyperNeRFDataModule": "hypernerf",
-    "forewarp.data.module.NHRDataModule": "nhr",
-    "forewarp.data.module.MulticamDataModule": "multicam",
-    "forewarp.data.module.PosedVideoDataModule": "posed_video",
-}
 
 VOXELS, PARTICLES = "forewarp.methods.voxel.", "forewarp.methods.particles."
 
@@ -104,7 +94,7 @@ def prepare(config: DictConfig) -> Prepared | None:
     # What follows loads torch; mistakes in the command have been answered before.
     from forewarp.data.checks import remarks
     from forewarp.runs.build import build_run
-    from forewarp.runs.fitted import Score, is_measured, named, tell
+    from forewarp.runs.fitted import Score, is_current, named, tell
 
     named(config.get("score"))
     config = hashed(config)
@@ -121,7 +111,7 @@ def prepare(config: DictConfig) -> Prepared | None:
 
         config = hashed(planned())
         run = build_run(config)
-    measured = bool(config.evaluate) and is_measured(run)
+    measured = bool(config.evaluate) and is_current(run.folder / "metrics.json", run)
     if not measured:
         run.check_device()
         run.datamodule.setup("fit")
@@ -140,8 +130,13 @@ def refuse_all(config: DictConfig) -> None:
         if config.get(key, choices[0]) not in choices:
             raise ValueError(f"{key}: expected {' or '.join(choices)}, but got {config[key]}")
     refuse_seeds(config)
-    refuse_two_models(config)
-    refuse_preset(config)
+    model, ablation = config.model.name, config.get("variant") or {}
+    if model not in ablation.get("of", [model]):
+        expected = f"model: expected {' or '.join(ablation.of)}, which {ablation.name} is a change of"
+        raise ValueError(f"{expected}, but got {model}; leave one of them out")
+    if config.preset.get("name") == "compact" and model not in ("forward", "backward"):
+        expected = "expected demo, fast or faithful, as compact is of model=forward and model=backward"
+        raise ValueError(f"preset: {expected}, but got compact beside model={model}")
     refuse_other_methods(config)
     refuse_numbers(config, "views", "sheets", "reduce")
     check_values(config)
@@ -153,7 +148,9 @@ def refuse_missing_scene(config: DictConfig) -> None:
     Raises:
         SceneError: listing the scenes that are there.
     """
-    reader = READERS.get(config.data.get("_target_"))
+    readers = {f"forewarp.data.module.{reader}datamodule".replace("_", ""): reader for reader in MARKERS}
+    # Data modules of others, and those that make their scene, check for themselves.
+    reader = readers.get(str(config.data.get("_target_")).lower())
     if reader is not None and config.get("absent", "refuse") == "refuse":
         scene_folder(Path(config.data.root).expanduser(), str(config.data.scene), reader)
 
@@ -166,15 +163,14 @@ def refuse_missing_start(config: DictConfig) -> None:
     if not str(config.model.get("_target_")).startswith(PARTICLES):
         raise ValueError(f"start: expected model=particles beside it, but got model={config.model.name}")
     if not any(Path(config.run).glob("*/last.ckpt")) and not any(Path(start).glob("*/done.json")):
-        raise ValueError(
-            f"start: expected a finished run of what stands still, but got none in {start}; make it by the "
-            "same command with windows=still, without data.window and start"
-        )
+        advice = "make it by the same command with windows=still, without data.window and start"
+        expected = "start: expected a finished run of what stands still"
+        raise ValueError(f"{expected}, but got none in {start}; {advice}")
 
 
 def refuse_seeds(config: DictConfig) -> None:
     """Refuse ``seeds=`` without ``--multirun``, which repeats the run, and in a search by a sweeper."""
-    swept = _is_swept()
+    swept = is_swept()
     if not swept and config.get("seeds", 1) != 1:
         raise ValueError(f"seeds: expected --multirun beside seeds={config.seeds}; add it, or use seed=N")
     if swept and "_optuna_" in str(HydraConfig.get().sweeper.get("_target_")):
@@ -182,29 +178,9 @@ def refuse_seeds(config: DictConfig) -> None:
         if config.get("seeds", 1) != 1:
             raise ValueError(f"seeds: expected 1 in a search, but got {config.seeds}; use seed=N")
         if seeds.startswith("range"):
-            raise ValueError(
-                "hydra.sweeper.params.seed: expected one seed, as this sweeper would search among several, "
-                f"but got {seeds}; add hydra.sweeper.params.seed=0"
-            )
-
-
-def refuse_preset(config: DictConfig) -> None:
-    """Refuse the paper's method in small for other methods, which have no such numbers."""
-    if config.preset.get("name") == "compact" and config.model.name not in ("forward", "backward"):
-        raise ValueError(
-            "preset: expected demo, fast or faithful, as compact is of model=forward and model=backward, but "
-            f"got compact beside model={config.model.name}"
-        )
-
-
-def refuse_two_models(config: DictConfig) -> None:
-    """Refuse an ablation of another method than ``model``."""
-    ablation = config.get("variant") or {}
-    if config.model.name not in ablation.get("of", [config.model.name]):
-        raise ValueError(
-            f"model: expected {' or '.join(ablation.of)}, which {ablation.name} is a change of, but got "
-            f"{config.model.name}; leave one of them out"
-        )
+            expected = "expected one seed, as this sweeper would search among several"
+            advice = "add hydra.sweeper.params.seed=0"
+            raise ValueError(f"hydra.sweeper.params.seed: {expected}, but got {seeds}; {advice}")
 
 
 def refuse_other_methods(config: DictConfig) -> None:
@@ -212,33 +188,20 @@ def refuse_other_methods(config: DictConfig) -> None:
 
     Effects of voxels are classes, those of particles numbers and words; particles see no single rays.
     """
-    target, choices = str(config.model.get("_target_")), {}
-    if HydraConfig.initialized():
-        choices = HydraConfig.get().runtime.choices
-    if not target.startswith((VOXELS, PARTICLES)):
+    target, model = str(config.model.get("_target_")), config.model.name
+    if not (HydraConfig.initialized() and target.startswith((VOXELS, PARTICLES))):
         return
     voxels = target.startswith(VOXELS)
-    for group, option in choices.items():
+    for group, option in HydraConfig.get().runtime.choices.items():
         own = group.startswith("model/") and "@" not in group  # else of a stage's own model
         part = config.model._get_node(group[6:]) if own else None
-        if part is None or part._is_none() or isinstance(part, DictConfig) == voxels:
-            continue
-        raise ValueError(
-            _of_another(f"{group}={option}", config.model.name, "particles" if voxels else "forward")
-        )
-    stages = [stage for stage in config.get("stage", {}).values() if stage is not None]
-    if not voxels and HydraConfig.initialized() and not any("model" in stage for stage in stages):
-        for one in typed_overrides():
-            if key_of(one) in ("preset.rays", "data.rays") and not one.endswith("=null"):
-                raise ValueError(_of_another(one, config.model.name, "forward"))
-
-
-def _of_another(option: str, model: str, owner: str) -> str:
-    """Return the line for an option that the chosen method has not, but ``owner`` has."""
-    return (
-        f"{option}: expected an option of model={model}, but got one of model={owner}; add model={owner}, or "
-        "leave it out"
-    )
+        if part is not None and not part._is_none() and isinstance(part, DictConfig) != voxels:
+            raise ValueError(of_another(f"{group}={option}", model, "particles" if voxels else "forward"))
+    if voxels or any("model" in (stage or {}) for stage in config.get("stage", {}).values()):
+        return
+    for typed in typed_overrides():
+        if key_of(typed) in ("preset.rays", "data.rays") and not typed.endswith("=null"):
+            raise ValueError(of_another(typed, model, "forward"))
 
 
 def refuse_numbers(config: DictConfig, *keys: str) -> None:
@@ -247,11 +210,10 @@ def refuse_numbers(config: DictConfig, *keys: str) -> None:
         value = config.get(key)
         if key not in config or (value is None and key in MAY_BE_NULL):
             continue
-        if key in LEAST and (type(value) is not int or value < LEAST[key]):
-            raise ValueError(f"{key}: expected a whole number of at least {LEAST[key]}, but got {value}")
-        low, high = RANGES.get(key, (value, value))
-        if key in RANGES and (type(value) not in (int, float) or not low <= value <= high):
-            raise ValueError(f"{key}: expected a number in [{low}, {high}], but got {value}")
+        if key in LEAST:
+            whole(value, key, LEAST[key])
+        else:
+            number(value, key, *RANGES[key])
 
 
 def viewer_of(config: DictConfig) -> dict | None:
@@ -264,15 +226,8 @@ def viewer_of(config: DictConfig) -> dict | None:
     require_viewer()
     from forewarp.viewer.server import check_address
 
-    if _is_swept() and port != 0 and "BasicLauncher" not in str(HydraConfig.get().launcher.get("_target_")):
-        raise ValueError(
-            f"port: expected 0 where jobs may run at once, so that each takes one that is free, but got "
-            f"{port}; set port=0, or launcher=local"
-        )
+    if is_swept() and port != 0 and "BasicLauncher" not in str(HydraConfig.get().launcher.get("_target_")):
+        expected = "port: expected 0 where jobs may run at once, so that each takes one that is free"
+        raise ValueError(f"{expected}, but got {port}; set port=0, or launcher=local")
     check_address(config.host, port)
     return {"host": config.host, "port": port}
-
-
-def _is_swept() -> bool:
-    """Tell whether this is a job of ``--multirun``."""
-    return HydraConfig.initialized() and HydraConfig.get().mode == RunMode.MULTIRUN

@@ -45,10 +45,8 @@ def render(config) -> None:
     from forewarp.runs.fitted import opened
 
     if config.path in ("orbit", "both") and saved.get("capture") != "cut_out":
-        print(
-            f"path={config.path} goes all around, also to where no camera of a capture from one side has "
-            "looked; path=swing stays between the training cameras"
-        )
+        around = f"path={config.path} goes all around, also to where no camera of a capture from one side has"
+        print(f"{around} looked; path=swing stays between the training cameras")
     file = write_film(config, *opened(saved))
     print(f"written: {file}" + (f" and {file.with_suffix('')}_masks" if config.masks == "true" else ""))
 
@@ -60,62 +58,50 @@ def write_film(config, run, module) -> Path:
 
     name = config.path if config.layer == "all" else f"{config.path}_{config.layer}"
     folder = Path(run.folder) / "videos"
-    pictures = pictures_of(config, module, run.datamodule, folder / f"{name}_masks")
     with Counted(config.path) as progress:
-        pictures = counted(pictures, config.frames, progress)
+        pictures = pictures_of(config, module, run.datamodule, folder / f"{name}_masks", progress)
         return write_video(folder / f"{name}.{config.format}", pictures, fps=float(config.fps))
 
 
-def pictures_of(config, module, datamodule, masks: Path):
-    """Render the pictures of the video that the config describes; write their masks, if it asks for any."""
+def pictures_of(config, module, datamodule, masks: Path, progress):
+    """Render the pictures of the video that the config describes, and report each to ``progress``.
+
+    If it asks for them, write for each which of its pixels are mostly what moves, ``masks/0000.png`` ...
+    """
+    from forewarp.drawing.images import keep_first, write_png
     from forewarp.evaluation.filmed import Fade
-    from forewarp.evaluation.images import make_shots, sized, video
+    from forewarp.evaluation.images import make_shots, moving_share, sized, video
     from forewarp.evaluation.layers import layer_of, moving_rows
     from forewarp.evaluation.trajectories import Trajectories
 
-    frames = datamodule.scene.train
+    frames, method, targets = datamodule.scene.train, module.method, datamodule.targets("test")
     cameras = [frame.camera for frame in frames]
-    targets = datamodule.targets("test")
     if config.view >= len(targets):
         raise ValueError(f"view: expected a test view, 0 to {len(targets) - 1}, but got {config.view}")
-    method, target, paint = module.method, targets[config.view], None
     moving = moving_rows(method, frames, "masks") if str(config.masks).lower() == "true" else None
     module.method = layer_of(method, config.layer, frames)
+    fade = None if datamodule.scene.has_alpha else Fade(cameras)
+    paints = [] if fade is None else [fade]
     if config.path == "trajectories":
-        paint = Trajectories(module, cameras, count=config.points, tail=float(config.tail))
-    camera = target.frame.camera
+        paints.append(Trajectories(module, cameras, count=config.points, tail=float(config.tail)))
+    target = targets[config.view]
+    camera, background = target.frame.camera, target.background.to(module.device)
     start = sized(camera, config.size or max(camera.width, camera.height, LEAST_SIZE))
     shots = make_shots(config.path, config.frames, float(config.time), start, cameras)
-    fade = None if datamodule.scene.has_alpha else Fade(cameras)
-    paints = [p for p in (fade, paint) if p is not None]
-    pictures = told_after(video(module, shots, target.background.to(module.device), paints), fade)
-    return pictures if moving is None else with_masks(pictures, method, shots, moving, masks)
 
+    def film():
+        if moving is not None:
+            keep_first(masks, len(shots))
+        for number, picture in enumerate(video(module, shots, background, paints)):
+            if moving is not None:
+                share = moving_share(method, moving, *shots[number])
+                write_png(masks / f"{number:04d}.png", (share > HALF).float())
+            progress(number + 1, len(shots))
+            yield picture
+        if fade is not None and (line := fade.told()):
+            print(line)
 
-def told_after(pictures, fade):
-    """Yield the pictures; say at their end what faded."""
-    yield from pictures
-    if fade is not None and (line := fade.told()):
-        print(line)
-
-
-def with_masks(pictures, method, shots, moving, folder: Path):
-    """Yield pictures; write for each which of its pixels are mostly what moves, ``folder/0000.png`` ..."""
-    from forewarp.drawing.images import keep_first, write_png
-    from forewarp.evaluation.images import moving_share
-
-    keep_first(folder, len(shots))
-    for number, (picture, (camera, time)) in enumerate(zip(pictures, shots)):
-        share = moving_share(method, moving, camera, time)
-        write_png(folder / f"{number:04d}.png", (share > HALF).float())
-        yield picture
-
-
-def counted(pictures, total: int, progress):
-    """Yield the pictures and report each to ``progress``."""
-    for done, picture in enumerate(pictures, 1):
-        progress(done, total)
-        yield picture
+    return film()
 
 
 def check(config) -> None:

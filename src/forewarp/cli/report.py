@@ -37,64 +37,30 @@ make reproduce-tables [DATA=DATASETS], make ablations, make effects. Runs withou
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Sequence
 from contextlib import suppress
 from glob import glob
-from importlib import import_module
 from pathlib import Path
-from typing import NamedTuple
+from pkgutil import resolve_name
 
 from omegaconf import DictConfig, OmegaConf
 
 from forewarp.cli.entry import command
 from forewarp.cli.mistakes import one_line
 from forewarp.cli.render import check, write_film
+from forewarp.data.files import number
 from forewarp.runs.config_files import project_root
 
-
-class Kind(NamedTuple):
-    """A kind of page: where its runs are if none are named, and the function that writes it.
-
-    ``options`` gives the function's further arguments from the config.
-    """
-
-    runs: str
-    function: str
-    options: Callable[[DictConfig], dict] = lambda config: {}
-
-
-def published_points(config: DictConfig) -> dict:
-    """Read the results of others that curves are drawn with."""
-    from forewarp.report.benchmark import OTHERS, read_published
-
-    return {"published": read_published(Path(config.published or OTHERS))}
-
-
-def printed_tables(config: DictConfig) -> dict:
-    """Name the file of the paper's printed numbers, where another is wanted."""
-    return {"published": Path(config.published)} if config.published else {}
-
-
-def curves_and_tables(config: DictConfig) -> dict:
-    """Name the folder of the pictures by ``kind=accuracy_time`` too."""
-    curves = Path(config.curves or f"{config.paths.runs}/accuracy_time/results")
-    return {"curves": curves, **printed_tables(config)}
-
-
-def target_and_points(config: DictConfig) -> dict:
-    """Give the PSNR that seconds are listed for, and the results of others."""
-    return {"target": config.target, **published_points(config)}
-
-
+# Where the runs of a kind are if none are named, what writes its page, and the options that it takes.
 KINDS = {
-    "accuracy_time": Kind("accuracy_time", "choices.write_accuracy_time", target_and_points),
-    "price_list": Kind("accuracy_time", "choices.write_price_list"),
-    "paper": Kind("paper", "paper.write_paper", curves_and_tables),
-    "ablation": Kind("ablations", "paper.write_ablation", printed_tables),
-    "minutes": Kind("minutes", "benchmark.write_minutes", published_points),
-    "methods": Kind("paper", "benchmark.write_methods"),
-    "effects": Kind("effects", "choices.write_effects"),
-    "search": Kind("search", "choices.write_search"),
+    "accuracy_time": ("accuracy_time", "choices.write_accuracy_time", ("target", "published_points")),
+    "price_list": ("accuracy_time", "choices.write_price_list", ()),
+    "paper": ("paper", "paper.write_paper", ("curves", "printed_tables")),
+    "ablation": ("ablations", "paper.write_ablation", ("printed_tables",)),
+    "minutes": ("minutes", "benchmark.write_minutes", ("published_points",)),
+    "methods": ("paper", "benchmark.write_methods", ()),
+    "effects": ("effects", "choices.write_effects", ()),
+    "search": ("search", "choices.write_search", ()),
 }
 NAMES = (*KINDS, "compare", "run")
 MEGABYTES = 0.3, 1000  # least and most that may be asked for
@@ -114,12 +80,27 @@ def report(config: DictConfig) -> None:
     elif not isinstance(config.runs, str | None):
         raise ValueError(f"runs: expected one folder for kind={config.kind}, but got a list; name one folder")
     else:
-        kind = KINDS[config.kind]
-        runs = Path(config.runs or f"{config.paths.runs}/{kind.runs}")
-        module, function = kind.function.split(".")
-        write = getattr(import_module(f"forewarp.report.{module}"), function)
-        for file in write(runs, Path(config.out or runs / "results"), **kind.options(config)):
+        place, write, options = KINDS[config.kind]
+        runs = Path(config.runs or f"{config.paths.runs}/{place}")
+        out = Path(config.out or runs / "results")
+        for file in resolve_name(f"forewarp.report.{write}")(runs, out, **options_of(config, options)):
             print(f"written: {file}")
+
+
+def options_of(config: DictConfig, names: Sequence[str]) -> dict:
+    """Return a page's options: the PSNR that seconds are listed for, a folder of curves, others' results and
+    the paper's printed numbers, where another file of them is wanted.
+    """
+    options = {"target": config.target} if "target" in names else {}
+    if "curves" in names:
+        options["curves"] = Path(config.curves or f"{config.paths.runs}/accuracy_time/results")
+    if "printed_tables" in names and config.published:
+        options["published"] = Path(config.published)
+    if "published_points" in names:
+        from forewarp.report.benchmark import OTHERS, read_published
+
+        options["published"] = read_published(Path(config.published or OTHERS))
+    return options
 
 
 def compared(config: DictConfig) -> str:
@@ -146,20 +127,28 @@ def run_page(config: DictConfig) -> str:
     Raises:
         ValueError: in one line, if ``config.run`` is not one run's folder, or a setting is wrong.
     """
-    from forewarp.report.run_page import media_of, read_story, room_of, write_run_page
+    from forewarp.report.run_page import FILMS, media_of, read_story, room_of, write_run_page
 
-    folder = _named(config)
+    number(config.megabytes, "megabytes", *MEGABYTES)
+    if type(config.render) is not bool:
+        raise ValueError(f"render: expected true or false, but got {config.render}")
+    if config.path not in (None, *FILMS):
+        raise ValueError(f"path: expected one of {', '.join(FILMS)} or null, but got '{config.path}'")
+    if config.run is None:
+        got, name = ("runs=", "<a run's folder>") if config.runs is not None else ("nothing", "runs/...")
+        raise ValueError(f"run: expected the folder of a run, but got {got}; set run={name}")
+    folder = Path(str(config.run))
     row = read_story(folder)
     file = Path(config.out or folder)
     file = file if file.suffix in (".html", ".htm") else file / "page.html"
+    most = float(config.megabytes)
 
     def written() -> str:
-        size = write_run_page(file, row, media, megabytes=float(config.megabytes))
-        about = f"written: {file}: {size / 1e6:.1f} of at most {config.megabytes:g} MB"
-        return "\n".join([*media.missing, about])
+        size = write_run_page(file, row, media, megabytes=most)
+        return "\n".join([*media.missing, f"written: {file}: {size / 1e6:.1f} of at most {most:g} MB"])
 
     media = media_of(row, config.path)  # loads torch; mistakes have been answered before
-    room_of(row, media, float(config.megabytes))  # refuses before minutes of rendering
+    room_of(row, media, most)  # refuses before minutes of rendering
     try:
         if config.render and not row["unfinished"]:
             _render(config, row, media)
@@ -172,23 +161,6 @@ def run_page(config: DictConfig) -> str:
             raise
         media.missing = [f"Rendering for this page stopped: {reason}."]
     return written()
-
-
-def _named(config: DictConfig) -> Path:
-    """Return the run's folder; refuse settings of which no page can be made."""
-    from forewarp.report.run_page import FILMS
-
-    low, high = MEGABYTES
-    if type(config.megabytes) not in (int, float) or not low <= config.megabytes <= high:
-        raise ValueError(f"megabytes: expected a number from {low} to {high}, but got {config.megabytes}")
-    if type(config.render) is not bool:
-        raise ValueError(f"render: expected true or false, but got {config.render}")
-    if config.path not in (None, *FILMS):
-        raise ValueError(f"path: expected one of {', '.join(FILMS)} or null, but got '{config.path}'")
-    if config.run is None:
-        got, folder = ("runs=", "<a run's folder>") if config.runs is not None else ("nothing", "runs/...")
-        raise ValueError(f"run: expected the folder of a run, but got {got}; set run={folder}")
-    return Path(str(config.run))
 
 
 def _render(config: DictConfig, row: dict, media) -> None:
@@ -209,9 +181,9 @@ def _render(config: DictConfig, row: dict, media) -> None:
     views = []
     for name, why in telling(row["images"]).items():
         if name in places:
-            camera = targets.frames[places[name]].camera
-            parts = parts_of(module, targets[places[name]], MOST_SIDE)
-            views.append(Shown(why, about(row, name), parts, max(camera.width, camera.height)))
+            target = targets[places[name]]
+            side = max(target.frame.camera.width, target.frame.camera.height)
+            views.append(Shown(why, about(row, name), parts_of(module, target, MOST_SIDE), side))
     media.views = views or media.views
     if config.path is None and isinstance(module.method, HasMovingGaussians):
         from forewarp.export.html import player_of, script_digests

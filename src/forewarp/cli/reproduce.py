@@ -43,6 +43,7 @@ import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -52,10 +53,8 @@ from forewarp.cli.entry import INTERRUPTED, MISTAKE, project_root
 from forewarp.runs.overrides import merged
 
 # Keys that may be typed, with what they are where they are left out.
-KEYS = dict.fromkeys(
-    shlex.split("data scenes methods model preset minutes steps seeds sweeps changes views out"), ""
-)
-KEYS |= {"jobs": "2", "threads": "", "launcher": "", "device": "gpu", "more": "", "small": ""}
+KEYS = shlex.split("data scenes methods model preset minutes steps seeds sweeps changes views out threads")
+KEYS = dict.fromkeys([*KEYS, "launcher", "more", "small"], "") | {"jobs": "2", "device": "gpu"}
 TABLES = ["dnerf", "hypernerf", "nhr", "lego_complete"]
 ABLATIONS = ["ablation_modules", "ablation_losses"]
 # Sweeps and the counterparts they run on without data, in two lanes of about the same length, a core each.
@@ -112,6 +111,21 @@ class Keys(SimpleNamespace):
         seeds = self.seeds or default
         return [] if not seeds else [f"seed={seeds}" if "," in seeds else f"seeds={seeds}"]
 
+    def given(self, *names: str) -> Sweep:
+        """Return those of the keys that were typed, as ``key=value``."""
+        return [f"{name}={getattr(self, name)}" for name in names if getattr(self, name)]
+
+    def of_two(self) -> str:
+        """Return the model, which is one of two.
+
+        Raises:
+            ValueError: for another one.
+        """
+        model = self.model or "particles"
+        if model not in ("particles", "forward"):
+            raise ValueError(f"model: expected particles or forward, but got {model}")
+        return model
+
 
 @dataclass
 class Job:
@@ -132,8 +146,7 @@ def plan_of(kind: str, keys: Keys) -> Job:
     if kind not in KINDS:
         raise ValueError(f"expected one of {', '.join(KINDS)}, but got '{kind}'")
     job = KINDS[kind](keys)
-    more = shlex.split(keys.more)
-    more += [f"{name}={getattr(keys, name)}" for name in ("threads", "launcher") if getattr(keys, name)]
+    more = [*shlex.split(keys.more), *keys.given("threads", "launcher")]
     job.lanes = [[merged(sweep, more) for sweep in lane] for lane in job.lanes if lane]
     return _made_small(job) if keys.small else job
 
@@ -151,8 +164,9 @@ def _made_small(job: Job) -> Job:
         moved = [word.replace("out=docs/", "out=runs/").replace("runs/", "runs/small/") for word in command]
         return moved if moved != command else [*moved, "paths.runs=runs/small"]
 
-    lanes = [[shortened(sweep) for sweep in lane] for lane in job.lanes]
-    return Job(lanes, [apart(command) for command in job.then], job.jobs, job.small)
+    job.lanes = [[shortened(sweep) for sweep in lane] for lane in job.lanes]
+    job.then = [apart(command) for command in job.then]
+    return job
 
 
 def words(text: str) -> list[str]:
@@ -188,14 +202,12 @@ def tables(keys: Keys) -> Job:
     if not keys.data and keys.sweeps not in ("", "all", "ablations"):
         raise ValueError(f"sweeps: expected all or ablations without data=, but got {keys.sweeps}")
     if "methods" in sweeps and not scenes:
-        raise ValueError(
-            "scenes: expected scenes=hook,... beside sweeps=methods, but got none; "
-            "methods=all fits all scenes by all methods"
-        )
+        advice = "methods=all fits all scenes by all methods"
+        raise ValueError(f"scenes: expected scenes=hook,... beside sweeps=methods, but got none; {advice}")
     preset = keys.preset or ("fast" if keys.data else "demo")
     minutes = keys.minutes or ("null" if preset == "faithful" else "5" if keys.data else "1")
-    base = [f"preset={preset}", *_until(minutes, keys.steps), *(keys.drawn("1")), "score=null"]
-    base += [f"views={keys.views}"] if keys.views else []
+    base = [f"preset={preset}", *_until(minutes, keys.steps), *keys.drawn("1"), "score=null"]
+    base += keys.given("views")
     out = keys.out or "runs/paper/results"
     then = [["report", "kind=paper", "runs=runs/paper", f"out={out}", "curves=docs/results"]]
     if not keys.data:
@@ -224,18 +236,14 @@ def _models(methods: str, sweep: str) -> Sweep:
 def _counterparts(sweeps: str, base: Sweep, keys: Keys) -> list[list[Sweep]]:
     """Return the sweeps of counterparts in two lanes: the tables', those of ``ablations``, or ``all``."""
     left_out = {"": [*ABLATIONS, "resolution"], "ablations": [*TABLES, "methods", "resolution"], "all": []}
-    lanes, base = [], [*base, "budget.clock=processor", "threads=1"]
-    for lane in LANES:
-        pairs = [pair.split(":") for pair in lane.split()]
-        lanes.append(
-            [
-                [*base, f"sweeps={sweep}", f"scene=counterpart_{data}", *_models(keys.methods, sweep)]
-                + (ROOM if sweeps == "ablations" and data == "hypernerf" else [])
-                for sweep, data in pairs
-                if sweep not in left_out[sweeps]
-            ]
-        )
-    return lanes
+    base = [*base, "budget.clock=processor", "threads=1"]
+
+    def of_pair(sweep: str, data: str) -> Sweep:
+        room = ROOM if sweeps == "ablations" and data == "hypernerf" else []
+        return [*base, f"sweeps={sweep}", f"scene=counterpart_{data}", *_models(keys.methods, sweep), *room]
+
+    lanes = [[pair.split(":") for pair in lane.split()] for lane in LANES]
+    return [[of_pair(*pair) for pair in lane if pair[0] not in left_out[sweeps]] for lane in lanes]
 
 
 def ablations(keys: Keys) -> Job:
@@ -243,37 +251,29 @@ def ablations(keys: Keys) -> Job:
     if keys.preset == "compact":
         return _at_rest(keys)
     if keys.data or keys.methods:
-        raise ValueError(
-            "data, methods: expected none, as ablations are of model=forward on counterparts, but got some; "
-            f"of real scenes: forewarp-reproduce tables data={keys.data or 'FOLDER'} sweeps=ablations"
-        )
+        expected = "data, methods: expected none, as ablations are of model=forward on counterparts"
+        advice = f"of real scenes: forewarp-reproduce tables data={keys.data or 'FOLDER'} sweeps=ablations"
+        raise ValueError(f"{expected}, but got some; {advice}")
     common = [f"preset={keys.preset or 'demo'}", f"views={keys.views or 9}", "score=null", *keys.drawn("2")]
-    by_minutes, by_steps = (
-        _counterparts("ablations", [*common, *until, *OF_ABLATIONS], keys)
-        for until in (_until(keys.minutes or "2.5"), _until(steps=keys.steps or "600"))
-    )
-    then = [_ablation_page(keys)]
+    untils = _until(keys.minutes or "2.5"), _until(steps=keys.steps or "600")
+    each = [_counterparts("ablations", [*common, *until, *OF_ABLATIONS], keys) for until in untils]
+    job = Job([first + second for first, second in zip(*each)], [_ablation_page(keys)], int(keys.jobs))
     if keys.small:  # without the scene that costs most; the two lanes take about as long
-        lanes = [
-            [sweep for lane in lanes for sweep in lane if ROOM[0] not in sweep]
-            for lanes in (by_minutes, by_steps)
-        ]
-        return Job(lanes, then, int(keys.jobs), small=("0.02", "8", "5"))
-    lanes = [first + second for first, second in zip(by_minutes, by_steps, strict=True)]
-    return Job(lanes, then, int(keys.jobs))
+        job.lanes = [[sweep for sweep in chain(*lanes) if ROOM[0] not in sweep] for lanes in each]
+        job.small = ("0.02", "8", "5")
+    return job
 
 
 def _at_rest(keys: Keys) -> Job:
     """Leave out each part where training has come to rest; a lane for each seed."""
     unused = ("minutes", "methods", "scenes", "sweeps", "model", "changes")
-    if given := [name for name in unused if getattr(keys, name)]:
+    if given := keys.given(*unused):
         raise ValueError(f"{', '.join(given)}: expected none beside preset=compact, but got some")
-    base = ["sweeps=ablation_at_rest", "score=null", "paths.runs=runs/ablations"]
+    base = ["sweeps=ablation_at_rest", "score=null", "paths.runs=runs/ablations", *keys.given("views")]
     base += _until(steps=keys.steps or "1") if keys.steps or keys.small else []
     base += [f"paths.scenes={keys.data}"] if keys.data else []
-    base += [f"views={keys.views}"] if keys.views else []
     seeds = keys.seeds or "2"
-    drawn = words(seeds) if "," in seeds else [str(seed) for seed in range(int(seeds))]
+    drawn = words(seeds) if "," in seeds else range(int(seeds))
     lanes = [[[*base, f"seed={seed}"]] for seed in drawn]
     return Job(lanes, [_ablation_page(keys)], int(keys.jobs))
 
@@ -285,19 +285,16 @@ def _ablation_page(keys: Keys) -> list[str]:
 def _compared(keys: Keys, base: Sweep) -> list[Sweep]:
     """All changes of the method's price list; with ``changes`` the reference, then these."""
     if keys.changes:
-        reference = [*base, "sweeps=accuracy_time", *([f"model={keys.model}"] if keys.model else [])]
+        reference = [*base, "sweeps=accuracy_time", *keys.given("model")]
         return [reference, [*reference, *shlex.split(keys.changes)]]
-    model = keys.model or "particles"
-    if model not in ("particles", "forward"):
-        raise ValueError(f"model: expected particles or forward, which have a price list, but got {model}")
-    return [[*base, f"sweeps=price_list_{model}"]]
+    return [[*base, f"sweeps=price_list_{keys.of_two()}"]]
 
 
 def accuracy_time(keys: Keys) -> Job:
     """Draw the accuracy of each choice against training time, on one scene."""
     base = [f"budget.minutes={keys.minutes or 3}", *keys.drawn()]
     base += keys.chosen(*words(keys.scenes or "jumpingjacks"))
-    return Job([_compared(keys, base)], [["report", "kind=accuracy_time", *_out(keys)]])
+    return Job([_compared(keys, base)], [["report", "kind=accuracy_time", *keys.given("out")]])
 
 
 def price_list(keys: Keys) -> Job:
@@ -314,14 +311,12 @@ def price_list(keys: Keys) -> Job:
 
 def effects(keys: Keys) -> Job:
     """Compare what a scene calls for with the preset, with every effect and with none."""
-    model = keys.model or "particles"
-    if model not in ("particles", "forward"):
-        raise ValueError(f"model: expected particles or forward, whose effects are compared, but got {model}")
+    model = keys.of_two()
     every = "all_effects" + "_particles" * (model == "particles")
     lane = ["sweeps=effects", *keys.drawn("" if keys.data else "2"), f"model={model}"]
     lane += [f"ablation=auto,base,{every},no_effects", f"budget.minutes={keys.minutes or 1}"]
     scenes = keys.chosen(*words(keys.scenes or "bouncingballs hook"))
-    return Job([[[*lane, *scenes]]], [["report", "kind=effects", *_out(keys)]])
+    return Job([[[*lane, *scenes]]], [["report", "kind=effects", *keys.given("out")]])
 
 
 def gpu(keys: Keys) -> Job:
@@ -337,19 +332,8 @@ def gpu(keys: Keys) -> Job:
     return Job([lane], then)
 
 
-def _out(keys: Keys) -> list[str]:
-    return [f"out={keys.out}"] if keys.out else []
-
-
-KINDS = {
-    "demo": demo,
-    "tables": tables,
-    "ablations": ablations,
-    "accuracy-time": accuracy_time,
-    "price-list": price_list,
-    "effects": effects,
-    "gpu": gpu,
-}
+KINDS = demo, tables, ablations, accuracy_time, price_list, effects, gpu
+KINDS = {kind.__name__.replace("_", "-"): kind for kind in KINDS}
 
 
 def run(job: Job) -> int:
@@ -375,16 +359,13 @@ def _call(name: str, arguments: list[str], prefix: str = "") -> int:
         arguments = ["--multirun", *arguments]
     print(f"{prefix}{shlex.join([f'forewarp-{name}', *arguments])}", flush=True)
     command = [str(Path(sys.executable).with_name(f"forewarp-{name}")), *arguments]
-    if prefix:
-        with subprocess.Popen(command, stdout=-1, stderr=subprocess.STDOUT, text=True) as process:
-            for line in process.stdout:
-                print(f"{prefix}{line}", end="", flush=True)
-        status = process.returncode
-    else:
-        status = subprocess.run(command).returncode
-    if status < 0 or status >= 128:
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT} if prefix else {}
+    with subprocess.Popen(command, text=True, **pipes) as process:
+        for line in process.stdout or ():
+            print(f"{prefix}{line}", end="", flush=True)
+    if process.returncode < 0 or process.returncode >= 128:
         raise KeyboardInterrupt
-    return status
+    return process.returncode
 
 
 def main() -> None:

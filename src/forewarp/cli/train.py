@@ -75,18 +75,13 @@ def train(config) -> float | None:
         return None
     with prepared.session():
         if prepared.measured:
-            return measured_before(prepared)
+            folder, reduce = prepared.run.folder, prepared.config.get("reduce")
+            words = f"run={folder}" + (f" reduce={reduce}" if reduce else "")
+            print(f"measured before: {folder}; again with forewarp-evaluate {words}")
+            return prepared.score.of()
         print(beginning(prepared.run, prepared.config), flush=True)
         module = prepared.run.fit()
         return measure(prepared, module)
-
-
-def measured_before(prepared) -> float | None:
-    """Say that there is nothing to do, and how to measure anew; return the score."""
-    folder, reduce = prepared.run.folder, prepared.config.get("reduce")
-    words = f"run={folder}" + (f" reduce={reduce}" if reduce else "")
-    print(f"measured before: {folder}; again with forewarp-evaluate {words}")
-    return prepared.score.of()
 
 
 def measure(prepared, module) -> float | None:

@@ -20,6 +20,9 @@ A run in training: forewarp-train ... viewer=true
 
 from __future__ import annotations
 
+from importlib.util import find_spec
+from pathlib import Path
+
 from forewarp.cli.entry import command
 
 TOLERANCE = 1e-3  # by which two runs' test cameras may differ, of their distance to the origin
@@ -31,8 +34,6 @@ def require_viewer() -> None:
     Raises:
         ImportError: naming what to install.
     """
-    from importlib.util import find_spec
-
     if find_spec("viser") is None:
         raise ImportError("viewer: expected viser, but got none; install forewarp[viewer]")
 
@@ -43,17 +44,15 @@ def view(config) -> None:
     from forewarp.runs.config import saved_config
 
     require_viewer()
-    runs = {"run": saved_config(config.run, config)}
+    runs = [saved_config(config.run, config)]
     if config.run2 is not None:
-        runs["run2"] = saved_config(config.run2, config, "run2")
+        runs.append(saved_config(config.run2, config, "run2"))
     refuse_numbers(config, "size", "points", "tail")
     # These load torch; mistakes have been answered before.
-    from pathlib import Path
-
     from forewarp.viewer.rendering import Viewer
     from forewarp.viewer.server import serve
 
-    renderers = [renderer_of(saved, config) for saved in runs.values()]
+    renderers = [renderer_of(saved, config) for saved in runs]
     scene = renderers[0].scene
     for other in renderers[1:]:
         refuse_other_scene(scene, other.scene)
@@ -70,8 +69,6 @@ def view(config) -> None:
 
 def renderer_of(saved, config):
     """Load a run's method."""
-    from pathlib import Path
-
     from forewarp.runs.fitted import opened
     from forewarp.viewer.rendering import SceneRenderer
 
@@ -96,9 +93,8 @@ def refuse_other_scene(scene, other) -> None:
         for a, b in zip(scene.test, other.test)
     )
     if not same:
-        raise ValueError(
-            f"run2: expected a run of the same {scene.name} as run= is, but got one with other test views"
-        )
+        expected = f"run2: expected a run of the same {scene.name} as run= is"
+        raise ValueError(f"{expected}, but got one with other test views")
 
 
 def main() -> None:

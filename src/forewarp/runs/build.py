@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
@@ -15,8 +15,9 @@ from lightning.pytorch.profilers import AdvancedProfiler, SimpleProfiler
 from omegaconf import DictConfig, OmegaConf
 
 from forewarp.clock import Clock
+from forewarp.data.files import whole
 from forewarp.data.films import FOLDER
-from forewarp.runs.config import IDENTITY, instead_of, saved_config, trust_of
+from forewarp.runs.config import IDENTITY, instead_of, plain, saved_config, trust_of
 from forewarp.runs.overrides import TEXTS, key_of
 from forewarp.scene.cloud import Handover
 from forewarp.training.callbacks import StageProgress
@@ -38,34 +39,26 @@ def build_run(config: DictConfig) -> Run:
         ValueError: naming the wrong key of the config.
     """
     if config.threads is not None:
-        if not (isinstance(config.threads, int) and config.threads >= 1):
-            raise ValueError(f"threads: expected a whole number > 0 or null, but got {config.threads}")
-        torch.set_num_threads(config.threads)
+        torch.set_num_threads(whole(config.threads, "threads", 1))
     check_trainer(config.trainer)
     device = partial(device_for, config)
     data = instantiate(config.data, _convert_="all")
     data.frames_folder = frames_folder(config)
-    plans = {name: stage_of(name, stage) for name, stage in config.stage.items()}
+    plans = {name: stage_of(name, stage) for name, stage in config.stage.items() if stage is not None}
     factories = [make for make in instantiate(config.callbacks, _convert_="all").values() if make is not None]
     trainer = instantiate(config.trainer, _convert_="all")
-    profiler = profiler_of(config.trainer.get("profiler"))
+    name = config.trainer.get("profiler")
+    if name is not None and name not in PROFILERS:
+        raise ValueError(f"trainer.profiler: expected simple, advanced or null, but got {name}")
+    profiler = PROFILERS.get(name)  # writes a table of calls into the stage's folder
 
     def make_trainer(folder: Path, callbacks: list, loggers: list):
-        return trainer(
-            # With auto, Lightning would choose a Mac's GPU, which lacks float64.
-            accelerator=device().type,
-            max_epochs=1,
-            max_steps=-1,
-            callbacks=callbacks,
-            logger=loggers,
-            default_root_dir=str(folder),
-            profiler=profiler and profiler(dirpath=str(folder), filename=PROFILE),
-            enable_checkpointing=False,
-            enable_progress_bar=False,
-            enable_model_summary=False,
-            limit_val_batches=0,
-            num_sanity_val_steps=0,
-        )
+        own = {"callbacks": callbacks, "logger": loggers, "default_root_dir": str(folder)}
+        own["profiler"] = profiler and profiler(dirpath=str(folder), filename=PROFILE)
+        off = dict.fromkeys(("enable_checkpointing", "enable_progress_bar", "enable_model_summary"), False)
+        off |= {"limit_val_batches": 0, "num_sanity_val_steps": 0}
+        # With auto, Lightning would choose a Mac's GPU, which lacks float64.
+        return trainer(accelerator=device().type, max_epochs=1, max_steps=-1, **own, **off)
 
     def make_callbacks(name: str, folder: Path) -> list:
         callbacks = [make() for make in factories]
@@ -117,10 +110,8 @@ def start_of(config: DictConfig) -> Callable[[], tuple[DynamicSceneModule, Hando
     def opened() -> tuple[DynamicSceneModule, Handover]:
         saved = saved_config(str(config.start), changes, "start")
         if saved.get("start") is not None:
-            raise ValueError(
-                f"start: expected a run that begins from images, but got {config.start}, which begins from "
-                f"another one; set start={saved.start}"
-            )
+            got = f"{config.start}, which begins from another one; set start={saved.start}"
+            raise ValueError(f"start: expected a run that begins from images, but got {got}")
         run = build_run(saved)
         return run.load(), load_handover(run.stage_folder(run.stages[-1]))
 
@@ -136,10 +127,8 @@ def loggers_of(config: DictConfig) -> RunLoggers:
     """
     named = config.get("logger") or {}
     if "_target_" in named or not all(OmegaConf.is_dict(node) for node in named.values()):
-        raise ValueError(
-            "logger: expected loggers by name, as logger: {csv: {_target_: ...}}, but got one without; "
-            "write its keys below a name"
-        )
+        expected = "logger: expected loggers by name, as logger: {csv: {_target_: ...}}"
+        raise ValueError(f"{expected}, but got one without; write its keys below a name")
     makers = instantiate(named, _convert_="all")
     runs = OmegaConf.select(config, "paths.runs") or Path(config.run).parent
     return RunLoggers(makers, Path(config.run), Path(runs), partial(hyperparameters, config))
@@ -165,9 +154,8 @@ def hyperparameters(config: DictConfig) -> dict[str, object]:
             found[name] = value if isinstance(value, bool | int | float | str) else str(value)
 
     for key in (*IDENTITY, "capture", "variant", "threads", "trainer"):
-        value = config.get(key)
-        if value is not None:
-            walk(OmegaConf.to_container(value, resolve=True) if OmegaConf.is_config(value) else value, key)
+        if (value := config.get(key)) is not None:
+            walk(plain(value), key)
     return found
 
 
@@ -177,38 +165,21 @@ def model_of(config: DictConfig) -> Callable:
     content.pop("name", None)
     model = instantiate(OmegaConf.create({"model": content}).model, _convert_="all")  # errors name the key
     if not callable(model):
-        raise ValueError(
-            f"model: expected a method that waits for its start, but got {type(model).__name__}; "
-            "add _partial_: true"
-        )
+        expected = "model: expected a method that waits for its start"
+        raise ValueError(f"{expected}, but got {type(model).__name__}; add _partial_: true")
     return model
 
 
-def stage_of(name: str, config: DictConfig | None) -> StagePlan | None:
+def stage_of(name: str, config: DictConfig) -> StagePlan:
     """Make a stage, without budget; a stage with a ``model`` has a method of its own."""
-    if config is None:
-        return None
     content = OmegaConf.to_container(config, resolve=True)
     own = content.pop("model", None)
     if "_target_" not in content:
-        raise ValueError(
-            f"stage.{name}: expected a stage of the method, but got only {', '.join(content)}, which is of "
-            "another method's; leave out what sets it, or choose another model"
-        )
+        got = f"only {', '.join(content)}, which is of another method's; leave out what sets it"
+        raise ValueError(f"stage.{name}: expected a stage of the method, but got {got}")
     plan = instantiate(content, _convert_="all")
     plan.model = None if own is None else model_of(OmegaConf.create(own))
     return plan
-
-
-def profiler_of(name: str | None) -> Callable | None:
-    """Return what makes the profiler of a stage, which writes a table of calls into the stage's folder.
-
-    Raises:
-        ValueError: for a name that is none of ``PROFILERS``.
-    """
-    if name is not None and name not in PROFILERS:
-        raise ValueError(f"trainer.profiler: expected simple, advanced or null, but got {name}")
-    return PROFILERS.get(name)
 
 
 def check_trainer(trainer: DictConfig) -> None:
@@ -222,18 +193,14 @@ def check_trainer(trainer: DictConfig) -> None:
     """
     precision = trainer.get("precision")
     if "16" in str(precision) and "bf16" not in str(precision):
-        raise ValueError(
-            f"trainer.precision: expected 32-true or bf16-mixed, but got {precision}; "
-            "float16 does not hold the gradients, use trainer.precision=bf16-mixed"
-        )
+        expected = "trainer.precision: expected 32-true or bf16-mixed, as float16 does not hold the gradients"
+        raise ValueError(f"{expected}, but got {precision}; use trainer.precision=bf16-mixed")
     devices, nodes = trainer.get("devices", 1), str(trainer.get("num_nodes", 1))
-    listed = isinstance(devices, Sequence) and not isinstance(devices, str)
-    if (len(devices) != 1 if listed else str(devices) != "1") or nodes != "1":
+    count = devices if isinstance(devices, int | str | None) else len(devices)
+    if (str(count), nodes) != ("1", "1"):
+        expected = "trainer.devices: expected 1, or the number of one GPU as [0]"
         got = f"{devices}" if nodes == "1" else f"{devices} on {nodes} nodes"
-        raise ValueError(
-            f"trainer.devices: expected 1, or the number of one GPU as [0], but got {got}; one process "
-            "trains a run, and --multirun with launcher=joblib trains several runs at once"
-        )
+        raise ValueError(f"{expected}, but got {got}; {instead_of('ddp')}")
 
 
 def device_for(config: DictConfig) -> torch.device:
@@ -246,10 +213,8 @@ def device_for(config: DictConfig) -> torch.device:
     """
     accelerator = config.trainer.accelerator
     if accelerator not in ("auto", "cpu", "gpu", "cuda"):
-        raise ValueError(
-            f"trainer.accelerator: expected auto, cpu, gpu or cuda, but got {accelerator}; "
-            + instead_of(accelerator)
-        )
+        expected = "trainer.accelerator: expected auto, cpu, gpu or cuda"
+        raise ValueError(f"{expected}, but got {accelerator}; {instead_of(accelerator)}")
     if accelerator in ("gpu", "cuda") and not torch.cuda.is_available():
         raise ValueError("trainer.accelerator: expected a GPU, but found none; use trainer=cpu")
     if accelerator == "auto":

@@ -11,7 +11,6 @@ import hashlib
 import importlib
 import inspect
 import json
-import math
 import os
 import re
 import sys
@@ -24,7 +23,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from forewarp.data.files import RECORD
+from forewarp.data.files import RECORD, number
 from forewarp.files import MOST_CONFIG, read_text, refuse_links
 from forewarp.runs.overrides import constant, key_of, typed_overrides
 
@@ -33,51 +32,36 @@ IDENTITY = ("data", "model", "objective", "stage", "preset", "budget", "seed")
 NOT_OF_RUN = ("cache_bytes", "disk_cache_bytes")  # keys of the data that change no frame
 HASH = "{hash}"
 # May be set beside resume=<run>.
-MAY_CHANGE = (
-    *("trainer", "threads", "lpips_weights", "sheets", "views", "reduce", "evaluate", "checkpoint_seconds"),
-    *("sentinel", "data_changed", "score", "viewer", "host", "port", "logger"),
-)
+MAY_CHANGE = "trainer", "threads", "lpips_weights", "sheets", "views", "reduce", "evaluate", "logger"
+MAY_CHANGE += "checkpoint_seconds", "sentinel", "data_changed", "score", "viewer", "host", "port"
 MOST_LEVELS = 40
 MOST_SEED = 2**31 - 100  # each stage adds its number, and what finds poses takes 31 bits
 TRUST_VARIABLE = "FOREWARP_TRUST"
 # Allowed beside the classes of forewarp. Listed by full name, as a prefix would allow all of torch.
-ELSEWHERE = {
-    "lightning.Trainer",
-    "lightning.pytorch.Trainer",
-    "lightning.pytorch.loggers.CSVLogger",
-    "lightning.pytorch.loggers.MLFlowLogger",
-    "lightning.pytorch.loggers.TensorBoardLogger",
-    "lightning.pytorch.loggers.WandbLogger",
-}
+_LOGGERS = ("CSVLogger", "MLFlowLogger", "TensorBoardLogger", "WandbLogger")
+ELSEWHERE = {f"lightning.pytorch.loggers.{name}" for name in _LOGGERS}
+ELSEWHERE |= {"lightning.Trainer", "lightning.pytorch.Trainer"}
 # Where a config may name our own classes: key at the top -> beginnings of their full names. Classes that
 # write to a path, such as the checkpoints' callback, are in none of these modules.
 _PARTS_OF_METHODS = ("forewarp.methods.", "forewarp.fields.", "forewarp.renderer.")
+_WATCHERS = ("curves.AccuracyCurve", "images.TrainingImages")
 HOMES = {
     "data": ("forewarp.data.module.", "forewarp.synth.module."),
     "model": _PARTS_OF_METHODS,
     "objective": ("forewarp.training.objective.",),
     "stage": (*_PARTS_OF_METHODS, "forewarp.training.objective.", "forewarp.training.schedule."),
-    "callbacks": (
-        "forewarp.training.callbacks.",
-        *("forewarp.evaluation.curves.AccuracyCurve", "forewarp.evaluation.images.TrainingImages"),
-    ),
+    "callbacks": ("forewarp.training.callbacks.", *(f"forewarp.evaluation.{name}" for name in _WATCHERS)),
     "trainer": ("lightning.Trainer", "lightning.pytorch.Trainer"),
     "logger": ("lightning.pytorch.loggers.", "forewarp.training.loggers.CsvLogger"),
 }
 # What other templates have as trainers: why there is none here, and what to type.
-_ONE_PROCESS = (
-    "one process trains a run: use trainer=gpu, and --multirun launcher=joblib trains several runs at once"
-)
-_NO_TRAINERS = {
-    "mps": "Apple's GPUs have no float64, which cameras and the cosine basis need: use trainer=cpu",
-    **dict.fromkeys(("ddp", "ddp_spawn", "ddp_sim", "fsdp", "deepspeed"), _ONE_PROCESS),
-}
+_ONE_PROCESS = "one process trains a run: use trainer=gpu, and --multirun launcher=joblib for several at once"
+_NO_TRAINERS = dict.fromkeys(("ddp", "ddp_spawn", "ddp_sim", "fsdp", "deepspeed"), _ONE_PROCESS)
+_NO_TRAINERS["mps"] = "Apple's GPUs have no float64, which cameras and the cosine basis need: use trainer=cpu"
 _RESERVED = {"_target_", "_partial_", "_recursive_", "_convert_"}
 # What OmegaConf and PyYAML raise for a text that is no config.
-_UNREADABLE = (
-    *(yaml.YAMLError, OmegaConfBaseException, ValueError, TypeError, AssertionError),
-    *(RecursionError, OverflowError),
-)
+_UNREADABLE = (yaml.YAMLError, OmegaConfBaseException, ValueError, TypeError, AssertionError, ArithmeticError)
+_UNREADABLE += (RecursionError,)
 _PARTS = {"name", "version", "sub_dir"}  # keys that make up the path a logger writes to
 # Its others.
 _PLAIN = {"default_hp_metric", "flush_logs_every_n_steps", "log_graph", "prefix"}
@@ -93,10 +77,8 @@ def hashed(config: DictConfig) -> DictConfig:
     32-true counts too, and for a run bounded by minutes the device and the number of threads. Before the
     digits of a job of a sweep stands what tells it apart; so do they where a sweep names no folders.
     """
-    typed = typed_overrides() if HydraConfig.initialized() else []
-    swept = bool(typed) and HydraConfig.get().mode == RunMode.MULTIRUN
-    words = in_words([word for word in typed if key_of(word) not in constant]) if swept else ""
-    run = str(config.run)
+    typed, run = typed_overrides(), str(config.run)
+    words = in_words([word for word in typed if key_of(word) not in constant]) if is_swept() else ""
     if words and HASH not in run and "run" not in map(key_of, typed):
         run += f"-{HASH}"
     if HASH in run:
@@ -105,6 +87,11 @@ def hashed(config: DictConfig) -> DictConfig:
         pattern = glob.escape(run).replace(HASH, f"*{digits}")
         config.run = next(iter(sorted(glob.glob(pattern))), run.replace(HASH, told))
     return config
+
+
+def is_swept() -> bool:
+    """Tell whether this is a job of ``--multirun``."""
+    return HydraConfig.initialized() and HydraConfig.get().mode == RunMode.MULTIRUN
 
 
 def instead_of(trainer: str) -> str:
@@ -134,12 +121,9 @@ def in_words(overrides: Sequence[str]) -> str:
 def content_hash(config: DictConfig, more: Sequence[str] = (), *others: object) -> str:
     """Return ten digits of a SHA-256 of ``IDENTITY`` and ``more`` keys of a config, and of ``others``."""
     make_absolute(config)
-    content = {key: config.get(key) for key in (*IDENTITY, *more)}
+    content = {key: plain(config.get(key)) for key in (*IDENTITY, *more)}
     if config.get("start") is not None:
         content["start"] = config.start
-    for key, part in content.items():
-        if OmegaConf.is_config(part):
-            content[key] = OmegaConf.to_container(part, resolve=True)
     for key in NOT_OF_RUN if isinstance(content["data"], dict) else ():
         content["data"].pop(key, None)
     precision = config.trainer.get("precision")
@@ -152,6 +136,11 @@ def content_hash(config: DictConfig, more: Sequence[str] = (), *others: object) 
     if others:
         content["others"] = others
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:10]
+
+
+def plain(part: object) -> object:
+    """Return a part of a config as dicts and lists, its interpolations resolved."""
+    return OmegaConf.to_container(part, resolve=True) if OmegaConf.is_config(part) else part
 
 
 def saved_config(
@@ -175,9 +164,8 @@ def saved_config(
         raise ValueError("run: expected the folder of a run, but got nothing; set run=runs/...")
     path = Path(run) / "config.yaml"
     if not path.is_file():
-        raise ValueError(
-            f"{path}: expected the configuration of a run, but got none; set {key}=<a run's folder>"
-        )
+        expected = f"{path}: expected the configuration of a run"
+        raise ValueError(f"{expected}, but got none; set {key}=<a run's folder>")
     saved = read_config(path, trust_of(changes.get("trust")), unused)
     for name in ("trainer", "threads", "lpips_weights", "sheets"):
         if changes.get(name) is not None:
@@ -199,7 +187,7 @@ def resumed(config: DictConfig) -> DictConfig:
     """
     if config.get("resume") is None:
         return config
-    typed = typed_overrides(of_sweep=True) if HydraConfig.initialized() else []
+    typed = typed_overrides(of_sweep=True)
     replaced = ["logger"] if any(key_of(override).split(".")[0] == "logger" for override in typed) else []
     trust = OmegaConf.create({"trust": config.get("trust")})
     saved = saved_config(str(config.resume), trust, "resume", replaced)
@@ -212,10 +200,9 @@ def resumed(config: DictConfig) -> DictConfig:
         elif key.split(".")[0] in MAY_CHANGE:
             saved[key.split(".")[0]] = config[key.split(".")[0]]
         elif key not in ("resume", "trust"):
-            raise ValueError(
-                f"{key}: expected no such key beside resume=, whose config.yaml holds it, but got "
-                f"{override}; beside it go {', '.join(MAY_CHANGE)}, data.root, trust"
-            )
+            expected = f"{key}: expected no such key beside resume=, whose config.yaml holds it"
+            known = f"{', '.join(MAY_CHANGE)}, data.root, trust"
+            raise ValueError(f"{expected}, but got {override}; beside it go {known}")
     return saved
 
 
@@ -241,19 +228,16 @@ def check_values(config: DictConfig) -> None:
     for key in ("data", "callbacks"):
         if not OmegaConf.is_dict(config.get(key)):
             raise ValueError(f"{key}: expected keys of its own, but got {config.get(key)!r:.80}")
-    seconds, weights = config.get("checkpoint_seconds"), config.get("lpips_weights")
-    if type(seconds) not in (int, float) or not 0 <= seconds < math.inf:
-        raise ValueError(f"checkpoint_seconds: expected a number >= 0, but got {seconds}")
+    number(config.get("checkpoint_seconds"), "checkpoint_seconds", 0)
     for key in ("seed", "data.seed", "data.synthesis.seed"):
         if key == "seed" or OmegaConf.select(config, key) is not None:
             check_seed(OmegaConf.select(config, key), key)
     if type(config.get("evaluate", True)) is not bool:
         raise ValueError(f"evaluate: expected true or false, but got {config.evaluate}")
+    weights = config.get("lpips_weights")
     places = weights if OmegaConf.is_list(weights) else [] if weights is None else [weights]
     if not all(isinstance(place, str) for place in places):
-        raise ValueError(
-            f"lpips_weights: expected a file, a folder, a list of them or null, but got {weights}"
-        )
+        raise ValueError(f"lpips_weights: expected a file, a folder, a list or null, but got {weights}")
     for name, callback in config.callbacks.items():
         if callback is not None and "_target_" not in (callback if OmegaConf.is_dict(callback) else {}):
             raise ValueError(f"callbacks.{name}: expected a class (_target_) or null, but got {callback}")
@@ -277,18 +261,15 @@ def refuse_to_synthesize(config: DictConfig) -> None:
     target, root = str(config.data.get("_target_")), Path(str(config.data.get("root")))
     folder = root if "LegoComplete" in target else root / str(config.data.get("scene"))
     if target.startswith("forewarp.synth.") and not (folder / RECORD).is_file():
-        raise ValueError(
-            f"data.root: expected the scene of the run, but got none in {folder}; write it with "
-            "forewarp-synthesize or the run's own command (command: in its config.yaml), or set data.root"
-        )
+        advice = "write it by the run's own command (command: in its config.yaml), or set data.root"
+        raise ValueError(f"data.root: expected the scene of the run, but got none in {folder}; {advice}")
 
 
 def make_absolute(config: DictConfig) -> None:
     """Make ``data.root`` and ``start`` absolute, as a run may be evaluated from another folder."""
-    if config.get("start") is not None:
-        config.start = str(Path(config.start).expanduser().resolve())
-    if not OmegaConf.is_missing(config.data, "root") and config.data.get("root") is not None:
-        config.data.root = str(Path(config.data.root).expanduser().resolve())
+    for part, key in ((config, "start"), (config.data, "root")):
+        if not OmegaConf.is_missing(part, key) and part.get(key) is not None:
+            part[key] = str(Path(part[key]).expanduser().resolve())
 
 
 def trusted_config(
@@ -312,13 +293,13 @@ def trusted_config(
     try:
         _check_events(text, where)
         config = OmegaConf.create(text)
-        content = OmegaConf.to_container(config) if isinstance(config, DictConfig) else None
+        content = OmegaConf.to_container(config)
     except _UNREADABLE as error:
         if str(error).startswith(f"{where}: "):
             raise
         reason = (str(error).splitlines() or [type(error).__name__])[0]
         raise ValueError(f"{where}: expected YAML, but got {reason}; delete the run's folder") from None
-    if content is None:
+    if not isinstance(content, dict):
         raise ValueError(f"{where}: expected a mapping, but got another kind; delete the run's folder")
     for key in unused:
         config[key] = content[key] = {}
@@ -344,10 +325,8 @@ def trust_of(named: str | Iterable[str] | None = None) -> tuple[str, ...]:
         for name in list(names) if isinstance(names, Iterable) else [names]:
             name = name.strip() if isinstance(name, str) else name
             if not isinstance(name, str) or not all(part.isidentifier() for part in name.split(".")):
-                example = "trust=[theirs]" if source == "trust" else f"{TRUST_VARIABLE}=theirs"
-                raise ValueError(
-                    f"{source}: expected names of packages, as {example}, but got {name!r:.80}; name each"
-                )
+                expected = f"names of packages, as {source}={'[theirs]' if source == 'trust' else 'theirs'}"
+                raise ValueError(f"{source}: expected {expected}, but got {name!r:.80}; name each")
             found[name] = None
     return tuple(found)
 
@@ -371,9 +350,7 @@ def check_planned(config: DictConfig, trust: Sequence[str]) -> None:
 
 
 def _check_events(text: str, where: Path) -> None:
-    """Refuse long texts, aliases and deep nesting, which can exhaust memory or the stack."""
-    if len(text) > MOST_CONFIG:
-        raise ValueError(f"{where}: expected at most {MOST_CONFIG} characters, but got {len(text)}")
+    """Refuse aliases and deep nesting, which can exhaust memory or the stack."""
     level = 0
     for event in yaml.parse(text, Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader)):
         if isinstance(event, yaml.AliasEvent):
@@ -414,23 +391,30 @@ def check_target(name: object, where: Path | str, key: str, trust: Sequence[str]
     if len(parts) < 2 or not all(part.isidentifier() for part in parts):
         raise ValueError(refusal)
     if name.startswith("lightning.pytorch.loggers."):
-        known = sorted(
-            one.rpartition(".")[2] for one in ELSEWHERE if one.startswith(parts[0] + ".pytorch.log")
-        )
-        raise ValueError(f"{refusal}; a folder may name {', '.join(known)}; add logger=NAME to resume=")
+        raise ValueError(f"{refusal}; a folder may name {', '.join(_LOGGERS)}; add logger=NAME to resume=")
     if parts[0] != "forewarp":
         _check_foreign(name, refusal, trust)
         return
-    module, _, last = name.rpartition(".")
-    try:
-        found = getattr(importlib.import_module(module), last)
-    except Exception as error:  # an import may raise anything
-        raise ValueError(f"{refusal} ({type(error).__name__})") from None
+    found = _imported(parts, refusal)
     # A module's own imports do not count: ``forewarp.cli.entry.Path`` is not a class of forewarp.
-    if not inspect.isclass(found) or found.__module__ != module:
+    if not inspect.isclass(found) or found.__module__ != name.rpartition(".")[0]:
         raise ValueError(refusal)
     if not name.startswith(home):
         raise ValueError(f"{refusal}, which is none for this key")
+
+
+def _imported(parts: Sequence[str], refusal: str) -> object:
+    """Import what a name names, first modules, then attributes."""
+    try:
+        found = importlib.import_module(parts[0])
+        for i, part in enumerate(parts[1:], 2):
+            if not hasattr(found, part) and inspect.ismodule(found):
+                importlib.import_module(".".join(parts[:i]))
+            found = getattr(found, part)
+        return found
+    except Exception as error:  # an import may raise anything
+        reason = str(error).partition("\n")[0] or type(error).__name__
+        raise ValueError(f"{refusal}, which cannot be imported ({reason:.120})") from None
 
 
 def _check_foreign(name: str, refusal: str, trust: Sequence[str]) -> None:
@@ -440,15 +424,7 @@ def _check_foreign(name: str, refusal: str, trust: Sequence[str]) -> None:
     parts = name.split(".")
     if any(part.startswith("__") for part in parts):
         raise ValueError(refusal)
-    try:
-        found = importlib.import_module(parts[0])
-        for i, part in enumerate(parts[1:], 2):  # first modules, then attributes
-            if not hasattr(found, part) and inspect.ismodule(found):
-                importlib.import_module(".".join(parts[:i]))
-            found = getattr(found, part)
-    except Exception as error:  # an import may raise anything
-        reason = str(error).partition("\n")[0] or type(error).__name__
-        raise ValueError(f"{refusal}, which cannot be imported ({reason:.120})") from None
+    found = _imported(parts, refusal)
     # A module's own imports do not count, or ``theirs.module.subprocess.run`` would be allowed.
     home = getattr(found, "__module__", None)
     if not callable(found) or not isinstance(home, str):
@@ -479,17 +455,12 @@ def _check_logger(node: dict, where: Path, key: str) -> None:
     if not node["_target_"].startswith(HOMES["logger"]):
         return
     if node.get("tracking_uri") is not None:
-        raise ValueError(
-            f"{where}: {key}.tracking_uri: expected null, but got {node['tracking_uri']!r:.80}; set the "
-            "environment's MLFLOW_TRACKING_URI in its place, or add logger=mlflow"
-        )
+        got, advice = f"{node['tracking_uri']!r:.80}", "set MLFLOW_TRACKING_URI, or add logger=mlflow"
+        raise ValueError(f"{where}: {key}.tracking_uri: expected null, but got {got}; {advice}")
     if others := sorted(node.keys() - _PARTS - _PLAIN - _RESERVED - {"tracking_uri"}):
-        raise ValueError(
-            f"{where}: {key}.{others[0]}: expected one of {', '.join(sorted(_PARTS | _PLAIN))}, but got "
-            "another option; delete it"
-        )
+        known = ", ".join(sorted(_PARTS | _PLAIN))
+        raise ValueError(f"{where}: {key}.{others[0]}: expected one of {known}; delete it")
     for name in sorted(_PARTS & node.keys()):
         if not re.fullmatch(r"(\w[\w.-]*)?", str(node[name])):
-            raise ValueError(
-                f"{where}: {key}.{name}: expected the name of a folder, but got {node[name]!r:.80}"
-            )
+            got = f"{node[name]!r:.80}"
+            raise ValueError(f"{where}: {key}.{name}: expected the name of a folder, but got {got}")

@@ -29,10 +29,8 @@ def project_root() -> Path:
     installed = PACKAGE if _holds_conf(PACKAGE) else PACKAGE.parents[1]
     root = Path(named).expanduser().resolve() if named else installed
     if not _holds_conf(root):
-        raise ValueError(
-            f"{root / 'conf'}: expected the configuration files, but got none; "
-            f"install forewarp again, or set {ROOT_VARIABLE} to a checkout"
-        )
+        advice = f"install forewarp again, or set {ROOT_VARIABLE} to a checkout"
+        raise ValueError(f"{root / 'conf'}: expected the configuration files, but got none; {advice}")
     return root
 
 
@@ -62,10 +60,9 @@ def installed() -> dict[str, Path]:
         if folders := [folder for folder in _folders(package) if folder.is_dir()]:
             found[package] = folders[0]
         else:
-            _warn(
-                f"entry point {entry.name} of {ENTRY_POINTS}: expected a package that has conf/, but got "
-                f"{package!r}; install that package again, or mend its pyproject.toml"
-            )
+            expected = f"entry point {entry.name} of {ENTRY_POINTS}: expected a package that has conf/"
+            advice = "install that package again, or mend its pyproject.toml"
+            _warn(f"{expected}, but got {package!r}; {advice}")
     return found
 
 

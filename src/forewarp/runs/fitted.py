@@ -8,13 +8,11 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import fmean
-from typing import ClassVar
 
 import numpy as np
 import torch
 from hydra.core.hydra_config import HydraConfig
 from hydra.experimental.callback import Callback
-from hydra.types import RunMode
 from hydra.utils import get_class
 from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
@@ -22,16 +20,16 @@ from torch import Tensor
 from forewarp.data.batches import COLORS, color_of
 from forewarp.data.checks import blind_frames, bounds
 from forewarp.evaluation.evaluate import evaluate, mean_scores, show
-from forewarp.fields.moving import GaussiansSnapshot, MovingGaussians
-from forewarp.fields.windows import Fading, MovingWindows
+from forewarp.fields.moving import MovingGaussians
+from forewarp.fields.windows import MovingWindows
 from forewarp.files import read_json, write_json
 from forewarp.glb.reader import read
-from forewarp.methods.method import HasMatter, HasTrajectories, Method, Snapshot
+from forewarp.methods.method import HasMatter, HasTrajectories, Method
 from forewarp.metrics.lpips import find_lpips, find_lpips_weights
 from forewarp.metrics.registry import METRICS, NETS, ImageSuite
 from forewarp.progress import Counted
 from forewarp.runs.build import build_run
-from forewarp.runs.config import saved_config, trust_of
+from forewarp.runs.config import is_swept, saved_config, trust_of
 from forewarp.runs.overrides import key_of, typed_overrides
 from forewarp.runs.session import warn_if_changed
 from forewarp.scene.camera import Camera, Vector, focus_point, mean_up, tensor_of
@@ -45,14 +43,15 @@ SPLITS = ("train", "val", "test", "held")
 _ROUGH = 1e-3  # by which a pose's axes may miss unit length and right angles
 
 
+@dataclass(repr=False)
 class Renderable:
     """What a fitted scene is asked for, wherever it comes from.
 
     Attributes:
         method: renders and moves points.
-        name: of the method, for errors.
+        name: of the method in the config, for errors.
         place: the folder or file that it was opened from.
-        cameras: of images that it was fitted to.
+        cameras: of images that it was fitted to, in order; of a file, some of them.
         background: (3,), the colour behind the images that it is measured on.
     """
 
@@ -61,7 +60,7 @@ class Renderable:
     place: Path
     cameras: Sequence[Camera]
     background: Tensor
-    _snapshot: Snapshot | GaussiansSnapshot | Fading | None = None
+    _snapshot = None  # the last that was rendered
 
     def __repr__(self) -> str:
         """Say in a line what it is and where it came from."""
@@ -182,38 +181,19 @@ class Fitted(Renderable):
     ['canonical', 'space', 'time']
 
     Attributes:
-        folder: the run's folder.
         config: the run's config.
         module: the fitted module; ``module.method`` is the method.
         scene: frames, box, canonical time.
-        background: (3,), the colour behind the images that it is measured on.
     """
 
-    folder: Path
     config: DictConfig
     module: DynamicSceneModule
     scene: Scene
-    background: Tensor
 
     @property
-    def place(self) -> Path:
+    def folder(self) -> Path:
         """The run's folder."""
-        return self.folder
-
-    @property
-    def method(self) -> Method:
-        """The fitted method."""
-        return self.module.method
-
-    @property
-    def name(self) -> str:
-        """The method's name in the config."""
-        return self.config.model.name
-
-    @property
-    def cameras(self) -> list[Camera]:
-        """The cameras of the training images, in order."""
-        return [frame.camera for frame in self.scene.train]
+        return self.place
 
     @property
     def metrics(self) -> dict:
@@ -232,38 +212,31 @@ class SceneFile(Renderable):
     """A scene of particles in one file, as ``forewarp.load("scene.glb")`` returns it; no run is needed.
 
     Attributes:
-        file: the file.
-        gaussians: all that it holds, moving; ``scene.gaussians.ellipsoids(0.5)`` are they at a time; of a
-            film in windows its ``MovingWindows``.
-        cameras: some of those that the scene was fitted to; a page begins at the first.
-        background: (3,), of the images.
         seconds: how long time lasts from 0 to 1, as a player shows it.
     """
 
-    file: Path
-    gaussians: MovingGaussians | MovingWindows
-    cameras: list[Camera]
-    background: Tensor
     seconds: float
-    name: ClassVar[str] = "particles"
 
     @property
-    def place(self) -> Path:
+    def file(self) -> Path:
         """The file."""
-        return self.file
+        return self.place
 
     @property
-    def method(self) -> MovingGaussians | MovingWindows:
-        """What renders, and moves points where it is not in windows."""
-        return self.gaussians
+    def gaussians(self) -> MovingGaussians | MovingWindows:
+        """All that the file holds, moving; ``scene.gaussians.ellipsoids(0.5)`` are they at a time.
+
+        Of a film in windows these are its ``MovingWindows``.
+        """
+        return self.method
 
 
 def open_file(file: Path, device: str = "cpu") -> SceneFile:
     """Open a ``scene.glb``; see ``forewarp.load``."""
     held = read(file)
-    setting, gaussians = held.setting, held.gaussians.to(device)
-    background = torch.tensor(setting.background)
-    return SceneFile(file, gaussians, list(setting.cameras), background, setting.seconds)
+    setting = held.setting
+    about = "particles", file, list(setting.cameras), torch.tensor(setting.background), setting.seconds
+    return SceneFile(held.gaussians.to(device), *about)
 
 
 def opened(config: DictConfig, device: str | torch.device | None = None) -> tuple[Run, DynamicSceneModule]:
@@ -303,15 +276,15 @@ def open_run(
     changes = {"trust": list(trust_of(trust)), "data": {"root": root}}
     config = saved_config(str(run), OmegaConf.create(changes))
     made, module = opened(config, device)
-    data = made.datamodule
-    return Fitted(run, config, module, data.scene, data.targets("test").background)
+    scene, background = made.datamodule.scene, made.datamodule.targets("test").background
+    cameras = [frame.camera for frame in scene.train]
+    return Fitted(module.method, config.model.name, run, cameras, background, config, module, scene)
 
 
 def measure_run(run: Run, module: DynamicSceneModule, config: DictConfig) -> dict:
     """Evaluate a fitted run by its config; print and return the numbers."""
     protocol = {"method": method_name(config), "preset": config.preset.name, "seed": config.seed}
-    budget = config.budget
-    protocol |= {"minutes": budget.minutes, "iterations": budget.iterations, "clock": budget.clock}
+    protocol |= {key: config.budget[key] for key in ("minutes", "iterations", "clock")}
     data, folder = run.datamodule, Path(run.folder)
     mask_box = data.scene.protocol.get("mask_box", False)
     suite = ImageSuite(find_lpips(extra=config.lpips_weights), mask_box=mask_box)
@@ -329,9 +302,8 @@ def measure_run(run: Run, module: DynamicSceneModule, config: DictConfig) -> dic
 
 def log_scores(run: Run, metrics: dict) -> None:
     """Log the scores of ``metrics.json`` to the run's loggers, as ``test/space/psnr``."""
-    scores = {
-        f"test/{split}/{name}": score for split, of in metrics["test"].items() for name, score in of.items()
-    }
+    rows = ((split, *row) for split, of in metrics["test"].items() for row in of.items())
+    scores = {f"test/{split}/{name}": score for split, name, score in rows}
     scores |= {"test/seconds": sum(metrics["seconds"].values())}
     run.loggers.log_scores(scores, sum(done["steps"] for done in run.finished().values()))
 
@@ -342,15 +314,9 @@ def method_name(config: DictConfig) -> str:
     return (own or config.model).get("name", config.model.name)
 
 
-def is_measured(run: Run) -> bool:
-    """Tell whether a run is finished and was measured after that."""
-    metrics = Path(run.folder) / "metrics.json"
-    return read_json(metrics) is not None and is_current(metrics, run)
-
-
 def is_current(file: Path, run: Run) -> bool:
-    """Tell whether a run is finished and a file was written after that."""
-    if not all(run.is_finished(stage) for stage in run.stages):
+    """Tell whether a run is finished and a JSON file was written after that."""
+    if read_json(file) is None or not all(run.is_finished(stage) for stage in run.stages):
         return False
     done = [run.stage_folder(stage) / "done.json" for stage in run.stages]
     return file.stat().st_mtime_ns >= max(path.stat().st_mtime_ns for path in done)
@@ -375,7 +341,7 @@ class Score:
 
     def __init__(self, run: Run, config: DictConfig) -> None:
         self.run, self.file, self.weights = run, Path(run.folder) / "score.json", config.get("lpips_weights")
-        self.typed = HydraConfig.initialized() and any(key_of(o) == "score" for o in typed_overrides())
+        self.typed = "score" in map(key_of, typed_overrides())
         self.name = named(config.get("score")) if self.typed or _sweeper() else None
         self.nets = [net for net in NETS if f"lpips_{net}" == self.name]
         if self.name is None:
@@ -445,17 +411,15 @@ def named(score: object) -> str | None:
         known = ", ".join(METRICS)
         raise ValueError(f"score: expected a metric of validation views ({known}) or null, but got {score!r}")
     if not METRICS[score].higher_is_better and "maximize" in str(_sweeper().get("direction")).lower():
-        raise ValueError(
-            f"hydra.sweeper.direction: expected minimize for {score}, which is less where it is better, "
-            "but got maximize; add hydra.sweeper.direction=minimize"
-        )
+        expected = f"minimize for {score}, which is less where it is better"
+        advice = "but got maximize; add hydra.sweeper.direction=minimize"
+        raise ValueError(f"hydra.sweeper.direction: expected {expected}, {advice}")
     return str(score)
 
 
 def _sweeper() -> DictConfig:
     """Return the config of the sweeper that began this job; empty if none did."""
-    swept = HydraConfig.initialized() and HydraConfig.get().mode == RunMode.MULTIRUN
-    return HydraConfig.get().sweeper if swept else OmegaConf.create({})
+    return HydraConfig.get().sweeper if is_swept() else OmegaConf.create({})
 
 
 class TellBest(Callback):
@@ -497,24 +461,19 @@ def doubts(run: Run, module: DynamicSceneModule, preset: str) -> list[str]:
         most = stage.settings.over(len(scene.train)).iterations
         steps, seconds = made[name]["steps"], made[name]["seconds"]
         if steps < min(FEW, most or FEW):
-            lines.append(
-                f"stage.{name} ended after {steps} step{'s' * (steps != 1)} in {seconds:.1f} s, too few to "
-                f"learn; raise budget.minutes, give it more of them (stage.{name}.share), "
-                f"{smaller}or leave it out (~stage.{name})"
-            )
+            few = f"ended after {steps} step{'s' * (steps != 1)} in {seconds:.1f} s, too few to learn"
+            advice = f"raise budget.minutes, give it more of them (stage.{name}.share), {smaller}"
+            lines.append(f"stage.{name} {few}; {advice}or leave it out (~stage.{name})")
     in_play = max(noted.get("frames_in_play", len(scene.train)) for noted in made.values())
     if in_play < len(scene.train) and run.stages[-1].settings.curriculum.get("most") is None:
-        lines.append(
-            f"{len(scene.train) - in_play} of {len(scene.train)} training images were never trained on, as "
-            "the budget ended before their times came in; raise it"
-        )
+        never = f"{len(scene.train) - in_play} of {len(scene.train)} training images were never trained on"
+        lines.append(f"{never}, as the budget ended before their times came in; raise it")
     if blind := blind_frames(scene):
         lines.append(f"{blind} of {len(scene.train)} training cameras see nothing of the box {bounds(scene)}")
     reached, one_color = training_psnr(run, module)
     if reached < max(LOW, one_color + ABOVE):
-        lines.append(
-            f"training images are reached to {reached:.1f} dB; one color alone has {one_color:.1f} dB"
-        )
+        far = f"training images are reached to {reached:.1f} dB"
+        lines.append(f"{far}; one color alone has {one_color:.1f} dB")
         steps = sum(noted["steps"] for noted in made.values())
         causes = _likeliest(run.datamodule.suspects, steps, preset)[:3]
         lines += [f"  likely cause {number}: {cause}" for number, cause in enumerate(causes, 1)]

@@ -19,10 +19,15 @@ OF_A_SWEEP = ("sweeps=", "seeds=", "launcher=")  # these say how jobs are run, n
 
 
 def typed_overrides(*, of_sweep: bool = False) -> list[str]:
-    """List the overrides of this job's command line; ``of_sweep`` keeps those that only say how jobs run."""
+    """List the overrides of this job's command line; ``of_sweep`` keeps those that only say how jobs run.
+
+    Outside of a job there are none.
+    """
     from hydra.core.hydra_config import HydraConfig
     from omegaconf import OmegaConf
 
+    if not HydraConfig.initialized():
+        return []
     typed = OmegaConf.to_container(HydraConfig.get().overrides.task)  # ${..} as typed
     return typed if of_sweep else [override for override in typed if not override.startswith(OF_A_SWEEP)]
 
@@ -49,8 +54,8 @@ def command_line(name: str, overrides: Sequence[str]) -> str:
 def command_of_job(name: str) -> str:
     """Return the command that runs this job of a sweep alone, quoted."""
     typed = [one for one in typed_overrides(of_sweep=True) if not one.startswith(("seeds=", "launcher="))]
-    has_sweep = any(one.startswith("sweeps=") for one in typed)
-    alone = ["hydra.mode=RUN"] if has_sweep else []  # a sweep's file sets the mode
+    # A sweep's file sets the mode.
+    alone = ["hydra.mode=RUN"] if any(one.startswith("sweeps=") for one in typed) else []
     return command_line(name, [*typed_folders(), *alone, *map(bare, typed)])
 
 
@@ -60,12 +65,9 @@ def bare(override: str) -> str:
     >>> bare(r"run=runs/$\{data.scene\}"), bare(r"data.scene='it\'s'"), bare("seed=1")
     ('run=runs/${data.scene}', "data.scene=it's", 'seed=1')
     """
-    from hydra.core.override_parser.overrides_parser import OverridesParser
-
-    if not TEXTS.fullmatch(key_of(override)):
-        return override
-    value = OverridesParser.create().parse_override(override).value()
-    return f"{key_of(override)}={value}" if isinstance(value, str) else override
+    read = parsed(override) if TEXTS.fullmatch(key_of(override)) else None
+    is_text = read is not None and isinstance(read.value(), str)
+    return f"{key_of(override)}={read.value()}" if is_text else override
 
 
 def as_text(arguments: Sequence[str]) -> list[str]:
@@ -79,33 +81,36 @@ def as_text(arguments: Sequence[str]) -> list[str]:
     >>> as_text(["data.scene=null", "data.scene={a}", "run=[a]", "runs=[a]"])
     ["data.scene='null'", "data.scene='{a}'", "run='[a]'", 'runs=[a]']
     """
-    swept, found = bool({"-m", "--multirun"} & set(arguments)), []
-    for argument in arguments:
+    swept = bool({"-m", "--multirun"} & set(arguments))
+
+    def quoted(argument: str) -> str:
         key, _, value = argument.partition("=")
-        name = key_of(argument)
-        typed = TEXTS.fullmatch(name) and value and not _is_of_hydra(name, value)
-        several = typed and (swept or name == "data.scene") and is_sweep(argument)
-        if typed and name != "data.scene" and value.startswith("~/"):
-            value = os.path.expanduser(value)
-        found.append(text_override(key, value) if typed and not several else argument)
-    return found
+        name, is_scene = key_of(argument), key_of(argument) == "data.scene"
+        # What Hydra's grammar has: text in quotes, interpolations, null and lists.
+        hydras = r"(['\"]).*\1|\$\{.*" + r"|null" * (not is_scene) + r"|\[.*" * (name in LISTS)
+        if not value or not TEXTS.fullmatch(name) or re.fullmatch(hydras, value, re.S):
+            return argument
+        if (swept or is_scene) and is_sweep(argument):
+            return argument
+        return text_override(key, value if is_scene or value[:2] != "~/" else os.path.expanduser(value))
+
+    return [quoted(argument) for argument in arguments]
 
 
-def _is_of_hydra(key: str, value: str) -> bool:
-    """Tell whether a path or name was typed as Hydra's grammar has it."""
-    is_quoted = len(value) > 1 and value[0] == value[-1] and value[0] in "'\""
-    is_null, is_list = value == "null" and key != "data.scene", value[0] == "[" and key in LISTS
-    return is_quoted or is_null or is_list or value.startswith("${")
-
-
-def is_sweep(override: str) -> bool:
-    """Tell whether Hydra takes an override for several values, as ``data.scene=hook,lego``."""
+def parsed(override: str):
+    """Return an override as Hydra reads it; None where its grammar has no such thing."""
     from hydra.core.override_parser.overrides_parser import OverridesParser
     from hydra.errors import HydraException
 
     with suppress(HydraException):
-        return OverridesParser.create().parse_override(override).is_sweep_override()
-    return False
+        return OverridesParser.create().parse_override(override)
+    return None
+
+
+def is_sweep(override: str) -> bool:
+    """Tell whether Hydra takes an override for several values, as ``data.scene=hook,lego``."""
+    read = parsed(override)
+    return read is not None and read.is_sweep_override()
 
 
 def text_override(key: str, text: str) -> str:
@@ -114,15 +119,9 @@ def text_override(key: str, text: str) -> str:
     >>> text_override("data.scene", "hand"), text_override("data.scene", "2024_11")
     ('data.scene=hand', "data.scene='2024_11'")
     """
-    from hydra.core.override_parser.overrides_parser import OverridesParser
-    from hydra.errors import HydraException
-
-    try:
-        read = OverridesParser.create().parse_override(f"{key}={text}")
-        if not read.is_sweep_override() and read.value() == text:
-            return f"{key}={text}"
-    except HydraException:  # its grammar has no such bare value
-        pass
+    read = parsed(f"{key}={text}")
+    if read is not None and not read.is_sweep_override() and read.value() == text:
+        return f"{key}={text}"
     # In Hydra's quotes a backslash is one unless a quote follows.
     inner = re.sub(r"(\\+)(?='|$)", r"\1\1", text).replace("'", r"\'")
     return f"{key}='{inner}'"
@@ -153,7 +152,7 @@ def without_switched_off(overrides: Sequence[str]) -> list[str]:
     >>> without_switched_off(["model/motion=none", "model.trajectory.features=12", "model.renderer.step=1"])
     ['model/motion=none', 'model.renderer.step=1']
     """
-    groups = [override.partition("=") for override in overrides if override.startswith("model/")]
-    off = [group.removeprefix("model/") for group, _, choice in groups if choice == "none"]
-    off = [f"model.{effect}" for effect in [*off, *(["trajectory"] if "motion" in off else [])]]
+    choices = [re.fullmatch("model/(.*)=none", override) for override in overrides]
+    off = [f"model.{choice[1]}" for choice in choices if choice]
+    off += ["model.trajectory"] if "model.motion" in off else []
     return [override for override in overrides if ".".join(key_of(override).split(".")[:2]) not in off]

@@ -20,7 +20,8 @@ from importlib import resources
 from pathlib import Path
 from typing import NamedTuple
 
-from hydra._internal.core_plugins import file_config_source, importlib_resources_config_source
+from hydra._internal.core_plugins import file_config_source as files
+from hydra._internal.core_plugins import importlib_resources_config_source as packages
 from hydra._internal.sources_registry import SourcesRegistry
 from hydra.core.config_store import ConfigStore
 from hydra.core.object_type import ObjectType
@@ -53,9 +54,8 @@ class _File(NamedTuple):
 @lru_cache(maxsize=512)  # parsing takes more than half of a composition
 def parsed(text: str) -> _File:
     """Parse a YAML file and the package that its header names."""
-    return _File(
-        OmegaConf.to_container(OmegaConf.create(text)), ConfigSource._get_header_dict(text)["package"]
-    )
+    package = ConfigSource._get_header_dict(text)["package"]
+    return _File(OmegaConf.to_container(OmegaConf.create(text)), package)
 
 
 class _Sections:
@@ -154,16 +154,14 @@ class _Sections:
 
 
 # Of the same names as Hydra's own, which it would register again otherwise.
-class FileConfigSource(_Sections, file_config_source.FileConfigSource):
+class FileConfigSource(_Sections, files.FileConfigSource):
     """Serves a folder with its sections."""
 
     def _folder(self):
         return Path(self.path)
 
 
-class ImportlibResourcesConfigSource(
-    _Sections, importlib_resources_config_source.ImportlibResourcesConfigSource
-):
+class ImportlibResourcesConfigSource(_Sections, packages.ImportlibResourcesConfigSource):
     """Serves a package's folder with its sections."""
 
     def _folder(self):

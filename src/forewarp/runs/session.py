@@ -7,7 +7,7 @@ import os
 import socket
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from filelock import FileLock, Timeout
@@ -71,14 +71,12 @@ def locked(folder: Path) -> Iterator[None]:
                 part.unlink()
         replace_file(holder, f"process {os.getpid()} on {socket.gethostname()}\n")
     except Timeout:
-        try:
+        process = ""
+        with suppress(OSError, ValueError):
             process = read_text(holder, 1000)[:200].strip()
-        except (OSError, ValueError):
-            process = ""
-        raise ValueError(
-            f"{folder}: expected a run that nobody works on, but got one of {process or 'another process'}; "
-            "wait for it, or use run=..."
-        ) from None
+        expected = f"{folder}: expected a run that nobody works on"
+        got = f"one of {process or 'another process'}; wait for it, or use run=..."
+        raise ValueError(f"{expected}, but got {got}") from None
     except OSError as error:
         lock.release()
         raise OSError(error.errno, error.strerror, f"run: {error.filename or folder}") from None
@@ -112,10 +110,8 @@ def claim(config: DictConfig, *, finished: bool = False) -> None:
     resolved = OmegaConf.create(OmegaConf.to_container(config, resolve=True, throw_on_missing=True))
     if any(path.parent.glob("*/last.ckpt")):
         if not path.is_file():
-            raise ValueError(
-                f"{path}: expected the configuration of the run, but got none; use run=... or delete the "
-                "folder"
-            )
+            expected = f"{path}: expected the configuration of the run"
+            raise ValueError(f"{expected}, but got none; use run=... or delete the folder")
         _refuse_another(path, read_config(path, None), resolved)
     if not finished:
         replace_file(path, OmegaConf.to_yaml(resolved))
@@ -131,10 +127,8 @@ def _refuse_another(path: Path, stored: DictConfig, config: DictConfig) -> None:
     if differ := list(_differences(before, now)):
         key, was, got = min(differ, key=lambda row: [not row[0].startswith(first) for first in _TYPED])
         more = f" (and {len(differ) - 1} more keys)" if len(differ) > 1 else ""
-        raise ValueError(
-            f"{path}: {key}: expected {was}, as the run that this folder holds, but got {got}{more}; "
-            "use run=<another folder>, or delete this one"
-        )
+        expected = f"{path}: {key}: expected {was}, as the run that this folder holds"
+        raise ValueError(f"{expected}, but got {got}{more}; use run=<another folder>, or delete this one")
 
 
 def _differences(old: object, new: object, key: str = "") -> Iterator[tuple[str, object, object]]:

@@ -29,41 +29,34 @@ def commands_of(arguments: Sequence[str]) -> list[list[str]]:
     windows=still seed=1 --multirun
     windows=each data.window=[0,0.5],[0.5,1] seed=1 --multirun
     """
-    keys = [key_of(argument) for argument in arguments]
-    if "windows" not in keys:
-        return [list(arguments)]
-    value = arguments[keys.index("windows")].partition("=")[2]
+    typed = {key_of(argument): argument.partition("=")[2] for argument in arguments}
+    value = typed.get("windows", "null")
     if value in ("still", "each", "null"):
         return [list(arguments)]
     if not value.isdecimal() or not 2 <= int(value) <= _MOST:
-        raise ValueError(
-            f"windows: expected a whole number from 2 to {_MOST}, still or each, but got {value}"
-        )
-    if "data.window" in keys:
+        expected = f"windows: expected a whole number from 2 to {_MOST}, still or each"
+        raise ValueError(f"{expected}, but got {value}")
+    if "data.window" in typed:
         raise ValueError(f"data.window: expected none beside windows={value}; leave it out, or windows=each")
-    others = [one for one, key in zip(arguments, keys) if key not in ("windows", "run", "-m", "--multirun")]
-    for one, key in zip(arguments, keys):
-        if key != "seed" and not one.startswith("-") and is_sweep(one):
-            raise ValueError(f"{key}: expected one value beside windows={value}, but got several; choose one")
-    folder = next((one.partition("=")[2] for one, key in zip(arguments, keys) if key == "run"), None)
+    others = [one for one in arguments if key_of(one) not in ("windows", "run", "-m", "--multirun")]
+    for one in arguments:
+        if key_of(one) != "seed" and not one.startswith("-") and is_sweep(one):
+            expected = f"{key_of(one)}: expected one value beside windows={value}"
+            raise ValueError(f"{expected}, but got several; choose one")
     is_shown = any(one.partition("=")[0] in _SHOWS for one in others)  # the config, of the first window
-    limits = f"[0,{1 / int(value):.6g}]" if is_shown else _limits(int(value))
+    ends = [f"{number / int(value):.6g}" for number in range(int(value) + 1)]
+    limits = [f"[{begin},{end}]" for begin, end in zip(ends, ends[1:])]  # as Hydra takes a choice of several
+    limits = ",".join(limits[:1] if is_shown else limits)
     still, each = ["windows=still"], ["windows=each", f"data.window={limits}"]
-    if folder is not None:
-        folder = folder.strip("'\"")
+    if "run" in typed:
+        folder = typed["run"].strip("'\"")
         still.append(text_override("run", f"{folder}/still"))
         each.append(text_override("run", f"{folder}/{{hash}}"))
-        each += [] if "start" in keys else [text_override("start", f"{folder}/still")]
+        each += [] if "start" in typed else [text_override("start", f"{folder}/still")]
     if is_shown:
         return [[*each, *others]]
-    commands = [each] if "start" in keys else [still, each]
+    commands = [each] if "start" in typed else [still, each]
     return [[*first, *others, "--multirun"] for first in commands]
-
-
-def _limits(count: int) -> str:
-    """Write where the windows begin and end, as Hydra takes a choice of several."""
-    ends = [f"{number / count:.6g}" for number in range(count + 1)]
-    return ",".join(f"[{begin},{end}]" for begin, end in zip(ends, ends[1:]))
 
 
 def scores_of(folders: Iterable[str | Path]) -> list[str]:
@@ -100,7 +93,6 @@ def check_film(windows: Sequence[tuple[float, float]], folder: Path) -> None:
     follow = all(abs(begin - end) < _SEAM for (begin, _), end in zip(windows, ends))
     if not windows or not follow or abs(ends[-1] - 1) > _SEAM:
         got = ", ".join(f"[{begin:g}, {end:g}]" for begin, end in windows) or "none"
-        raise ValueError(
-            f"{folder}: expected a run, or windows that follow one another from 0 to 1, but got {got}; train "
-            "those that are missing (windows=N), move others elsewhere"
-        )
+        expected = f"{folder}: expected a run, or windows that follow one another from 0 to 1"
+        advice = "train those that are missing (windows=N), move others elsewhere"
+        raise ValueError(f"{expected}, but got {got}; {advice}")

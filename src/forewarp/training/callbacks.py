@@ -57,19 +57,14 @@ class StageProgress(lightning.Callback):
             with module.clock.paused():
                 self._line.show(fraction, left, text)
 
-    def on_train_end(self, trainer, module) -> None:
-        """Leave a last line with the final values."""
-        self._close(module)
-
-    def on_exception(self, trainer, module, exception) -> None:
-        """Restore the terminal."""
-        self._close(module)
-
-    def _close(self, module) -> None:
+    def on_train_end(self, trainer, module, exception=None) -> None:
+        """Leave a last line with the final values, also after an exception, and restore the terminal."""
         if self._line is not None:
             text = self._text(module) if module.last else "no step"
             self._line.close(module.fraction, f"{time_text(module.clock.seconds)} trained | {text}")
             self._line = None
+
+    on_exception = on_train_end
 
     def _text(self, module) -> str:
         curriculum, (kind, count) = module.curriculum, module.method.size

@@ -11,6 +11,7 @@ import io
 import math
 import signal
 import sys
+import threading
 import zipfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -39,11 +40,9 @@ class KeepCheckpoint(lightning.Callback):
         asked: whether Ctrl-C was pressed inside ``listening()``.
     """
 
-    def __init__(
-        self, path: Path, seconds: float, check: Callable[[lightning.Trainer], None] = lambda trainer: None
-    ) -> None:
+    def __init__(self, path: Path, seconds: float, check: Callable[[lightning.Trainer], None]) -> None:
         self.path, self.every, self.check = Path(path), seconds, check
-        self.asked, self._next = False, seconds
+        self.asked = False
 
     def on_train_start(self, trainer, module) -> None:
         """Count from where a continued run stands."""
@@ -76,19 +75,17 @@ class KeepCheckpoint(lightning.Callback):
             signal.signal(signal.SIGINT, signal.default_int_handler)
             self.asked = True
             with suppress(OSError, RuntimeError):  # it may interrupt another print
-                print(
-                    "\nends this step and saves it; Ctrl-C again stops at once", file=sys.stderr, flush=True
-                )
+                says = "\nends this step and saves it; Ctrl-C again stops at once"
+                print(says, file=sys.stderr, flush=True)
 
-        installed = False
-        if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
-            with suppress(ValueError):  # raised in another thread
-                signal.signal(signal.SIGINT, ask)
-                installed = True
+        in_main = threading.current_thread() is threading.main_thread()
+        ours = in_main and signal.getsignal(signal.SIGINT) is signal.default_int_handler
+        if ours:
+            signal.signal(signal.SIGINT, ask)
         try:
             yield
         finally:
-            if installed:  # Lightning may have replaced it
+            if ours:  # Lightning may have replaced it
                 signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
@@ -106,16 +103,14 @@ def check_checkpoint(path: Path, module: DynamicSceneModule) -> dict:
     try:
         content = read_archive(path)
     except ValueError as error:
-        raise ValueError(
-            f"{path}: expected a checkpoint, but it cannot be read ({error}); delete it"
-        ) from None
+        expected = f"{path}: expected a checkpoint"
+        raise ValueError(f"{expected}, but it cannot be read ({error}); delete it") from None
     if not isinstance(content.get("state_dict"), dict):
         raise ValueError(f"{path}: expected a checkpoint, but it holds no weights; delete it")
     if differ := misfits(module, content["state_dict"]):
-        raise ValueError(
-            f"{path}: expected a checkpoint of this configuration, but got one that differs in "
-            f"{', '.join(differ[:3])}; use another run folder, or the configuration that it was made with"
-        )
+        got = f"one that differs in {', '.join(differ[:3])}"
+        advice = "use another run folder, or the configuration that it was made with"
+        raise ValueError(f"{path}: expected a checkpoint of this configuration, but got {got}; {advice}")
     return content
 
 
@@ -131,17 +126,13 @@ def check_state(path: Path, module: DynamicSceneModule) -> tuple[int, float]:
     content, saved = check_checkpoint(path, module), {}
     module.on_save_checkpoint(saved)
     needed = saved["forewarp"].keys()
-    try:
+    with suppress(KeyError, TypeError, AttributeError):
         state, steps = content["forewarp"], content["global_step"]
         seconds = state["clock"]["seconds"]
         if needed <= state.keys() and type(steps) is int and type(seconds) in (int, float):
             return steps, seconds
-    except (KeyError, TypeError, AttributeError):
-        pass
-    raise ValueError(
-        f"{path}: expected a checkpoint with its step and {', '.join(needed)}, but got one without; "
-        "delete it to begin the stage anew"
-    )
+    expected = f"{path}: expected a checkpoint with its step and {', '.join(needed)}"
+    raise ValueError(f"{expected}, but got one without; delete it to begin the stage anew")
 
 
 def misfits(module: DynamicSceneModule, weights: dict) -> list[str]:
@@ -255,15 +246,9 @@ def save_handover(handover: Handover, folder: Path) -> None:
         if handover.paths is not None:
             tensors |= {"times": handover.times, "paths": handover.paths}
         write_archive(folder / POINTS, {name: t.contiguous() for name, t in tensors.items()})
-    numbers = {
-        "low": handover.box.low,
-        "high": handover.box.high,
-        "tight": handover.tight,
-        "frames_in_play": handover.frames_in_play,
-        "size": None if cloud is None else cloud.size,
-        "notes": dict(handover.notes),
-    }
-    write_json(folder / NUMBERS, numbers)
+    numbers = {"low": handover.box.low, "high": handover.box.high, "tight": handover.tight}
+    numbers |= {"frames_in_play": handover.frames_in_play, "size": None if cloud is None else cloud.size}
+    write_json(folder / NUMBERS, numbers | {"notes": dict(handover.notes)})
 
 
 def load_handover(folder: Path) -> Handover:
@@ -273,7 +258,7 @@ def load_handover(folder: Path) -> Handover:
         ValueError: naming the file that is missing, damaged, or something else.
     """
     path = folder / NUMBERS
-    try:
+    with suppress(KeyError, TypeError, ValueError, AttributeError, OSError):
         content = read_json(path) or {}
         box, notes = Box(tuple(content["low"]), tuple(content["high"])), content["notes"]
         if not all(math.isfinite(value) for value in notes.values()):
@@ -283,8 +268,6 @@ def load_handover(folder: Path) -> Handover:
             path = folder / POINTS
             cloud, times, paths = _points(read_archive(path), float(content["size"]))
         return Handover(box, content["tight"], content["frames_in_play"], cloud, times, paths, notes)
-    except (KeyError, TypeError, ValueError, AttributeError, OSError):
-        pass
     raise ValueError(f"{path}: expected what a stage leaves to the next, but got something else; delete it")
 
 

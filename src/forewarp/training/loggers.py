@@ -7,7 +7,7 @@ import os
 import sys
 from collections.abc import Callable, Mapping
 from contextlib import nullcontext
-from functools import cache, partial
+from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -83,9 +83,8 @@ class RunLoggers:
         for name, maker in self.makers.items():
             package = _PACKAGES.get(_class_of(maker), "lightning")
             if find_spec(package) is None:
-                raise ImportError(
-                    f"logger: expected {package} for {name}, but got none; install forewarp[trackers]"
-                )
+                expected = f"logger: expected {package} for {name}"
+                raise ImportError(f"{expected}, but got none; install forewarp[trackers]")
 
     def open(self, before: int = 0, step: int = 0) -> list[Logger]:
         """List the open loggers. From now on they log a stage's steps on the axis of the run.
@@ -107,10 +106,9 @@ class RunLoggers:
                 except (OSError, KeyboardInterrupt):
                     raise
                 except Exception as error:  # of the tracker's own kinds
-                    raise ValueError(
-                        f"logger.{name}: expected a tracker that takes this run, but got "
-                        f"{_in_a_line(error)}; mend it, or leave it out of logger=[...]"
-                    ) from error
+                    got = f"{_in_a_line(error)}; mend it, or leave it out of logger=[...]"
+                    expected = f"logger.{name}: expected a tracker that takes this run"
+                    raise ValueError(f"{expected}, but got {got}") from error
             if ids:
                 write_json(self.folder / IDS, ids)
         return list(self._open.values())
@@ -120,18 +118,16 @@ class RunLoggers:
         title = "/".join(self.folder.resolve().parts[-2:])
         if kind in _PACKAGES:
             self.runs.mkdir(parents=True, exist_ok=True)
+        options = {"save_dir": str(self.folder)}
+        if kind is WandbLogger:  # its links may not lie in a run's folder
+            options = {"save_dir": str(self.runs), "name": title, "id": known}
+        elif kind is MLFlowLogger:
+            options = self._store(maker) | {"run_name": title, "run_id": known}
+        elif kind in (TensorBoardLogger, CsvLogger):
+            options |= {"purge_step": step + 1} if kind is TensorBoardLogger else {"first": step}
         # Only one job of a sweep may make the database.
         with FileLock(self.runs / ".mlflow.lock") if kind is MLFlowLogger else nullcontext():
-            if kind is WandbLogger:  # its links may not lie in a run's folder
-                logger = maker(save_dir=str(self.runs), name=title, id=known)
-            elif kind is MLFlowLogger:
-                logger = maker(**self._store(maker), run_name=title, run_id=known)
-            elif kind is TensorBoardLogger:
-                logger = maker(save_dir=str(self.folder), purge_step=step + 1)
-            elif kind is CsvLogger:
-                logger = maker(save_dir=str(self.folder), first=step)
-            else:
-                logger = maker(save_dir=str(self.folder))
+            logger = maker(**options)
             _ = logger.experiment  # connects
         if kind in _PACKAGES:
             ids[name] = str(logger.version)
@@ -142,7 +138,7 @@ class RunLoggers:
 
         def log_on_the_runs_axis(metrics: Mapping[str, float], step: int | None = None) -> None:
             step = None if step is None else step + self.before
-            self._guard(name, lambda: log_metrics(metrics, step))
+            self._guard(name, log_metrics, metrics, step)
 
         logger.finalize = lambda status: self._guard(name, logger.save)  # Lightning's, after each stage
         logger.log_metrics = log_on_the_runs_axis
@@ -156,18 +152,16 @@ class RunLoggers:
         here = self.runs.resolve()
         return {"tracking_uri": f"sqlite:///{here}/mlflow.db", "artifact_location": f"{here}/mlflow"}
 
-    def _guard(self, name: str, call: Callable[[], None]) -> None:
+    def _guard(self, name: str, call: Callable, *given, **options) -> None:
         """Let a run outlive a tracker that fails: tell it once, and leave it out from then on."""
         if name in self._failed:
             return
         try:
-            call()
+            call(*given, **options)
         except Exception as error:  # of the tracker's own kinds
             self._failed.add(name)
-            print(
-                f"warning: logger.{name} failed and is left out from now on: {_in_a_line(error)}",
-                file=sys.stderr,
-            )
+            told = f"warning: logger.{name} failed and is left out from now on"
+            print(f"{told}: {_in_a_line(error)}", file=sys.stderr)
 
     def log(self, scalars: Mapping[str, float], step: int) -> None:
         """Log scalars of a step of the stage that ``open`` has begun.
@@ -183,14 +177,11 @@ class RunLoggers:
         pixels, at = to_bytes(image), step + self.before
         for name, logger in (self._open or {}).items():
             if isinstance(logger, TensorBoardLogger):
-                add = partial(logger.experiment.add_image, title, pixels, at, dataformats="HWC")
+                self._guard(name, logger.experiment.add_image, title, pixels, at, dataformats="HWC")
             elif isinstance(logger, MLFlowLogger):
-                add = partial(logger.experiment.log_image, logger.run_id, pixels, key=title, step=at)
+                self._guard(name, logger.experiment.log_image, logger.run_id, pixels, key=title, step=at)
             elif hasattr(logger, "log_image"):  # Weights & Biases, and loggers made like it
-                add = partial(logger.log_image, title, [pixels], step=step)
-            else:
-                continue
-            self._guard(name, add)
+                self._guard(name, logger.log_image, title, [pixels], step=step)
 
     def log_scores(self, scores: Mapping[str, float], step: int) -> None:
         """Log the scores of a measured run, in TensorBoard beside its hyperparameters (HPARAMS).
@@ -201,8 +192,7 @@ class RunLoggers:
         """
         for name, logger in zip(self.makers, self.open(0, step)):
             if isinstance(logger, TensorBoardLogger):
-                given = dict(self.hyperparameters()), dict(scores), step
-                self._guard(name, partial(logger.log_hyperparams, *given))
+                self._guard(name, logger.log_hyperparams, dict(self.hyperparameters()), dict(scores), step)
             else:
                 logger.log_metrics(dict(scores), step)
             self._guard(name, logger.save)
@@ -213,9 +203,9 @@ class RunLoggers:
     def __exit__(self, kind: type | None, *_) -> None:
         """Close all loggers, as failed after an exception."""
         for (name, logger), close in zip((self._open or {}).items(), self._closing):
-            self._guard(name, partial(close, "success" if kind is None else "failed"))
+            self._guard(name, close, "success" if kind is None else "failed")
             if isinstance(logger, WandbLogger):  # else the next job of a sweep would go on in this run
-                self._guard(name, partial(logger.experiment.finish, exit_code=0 if kind is None else 1))
+                self._guard(name, logger.experiment.finish, exit_code=0 if kind is None else 1)
         self._open, self._closing = None, []
 
 

@@ -45,9 +45,7 @@ class DynamicSceneModule(lightning.LightningModule):
         super().__init__()
         self.automatic_optimization = False
         method.check(settings.name, (), objective.names, objective.literal)
-        self.method = method
-        self.objective, self.settings = objective, settings
-        self.curriculum = curriculum
+        self.method, self.objective, self.settings, self.curriculum = method, objective, settings, curriculum
         self.generator = torch.Generator().manual_seed(seed)
         self.clock = Clock()
         self.last: dict[str, float] = {}
@@ -99,13 +97,9 @@ class DynamicSceneModule(lightning.LightningModule):
         loss, raw = total(step, factors)
         error = float(step.squared_error)
         self.curriculum.report(batch.frame, error)
-        self.last = {
-            "loss": float(loss.detach()),
-            "psnr": -10 * math.log10(max(error, 1e-10)),
-            "frames_in_play": self.curriculum.in_play,
-            **self._noted,
-            **step.noted,
-        } | {f"loss/{name}": float(value) for name, value in raw.items()}
+        self.last = {"loss": float(loss.detach()), "psnr": -10 * math.log10(max(error, 1e-10))}
+        self.last |= {"frames_in_play": self.curriculum.in_play, **self._noted, **step.noted}
+        self.last |= {f"loss/{name}": float(value) for name, value in raw.items()}
         return loss, step.gradients
 
     def look(self, batch: Batch, factors: Mapping[str, float]) -> Step:
@@ -173,12 +167,9 @@ class DynamicSceneModule(lightning.LightningModule):
 
     def on_save_checkpoint(self, checkpoint: dict) -> None:
         """Add all that a continued run needs to equal an uninterrupted one to the bit."""
-        checkpoint["forewarp"] = {
-            "generator": self.generator.get_state(),
-            "torch_rng": torch.get_rng_state(),
-            "curriculum": self.curriculum.state_dict(),
-            "clock": self.clock.state_dict(),
-        }
+        state = {"generator": self.generator.get_state(), "torch_rng": torch.get_rng_state()}
+        state |= {"curriculum": self.curriculum.state_dict(), "clock": self.clock.state_dict()}
+        checkpoint["forewarp"] = state
 
     def on_load_checkpoint(self, checkpoint: dict) -> None:
         """Restore what ``on_save_checkpoint`` added."""

@@ -44,18 +44,15 @@ class Objective:
 
     def factors(self, number: int) -> dict[str, float]:
         """Return the factor of each term that counts in step ``number``."""
-        every = {name: self.every.get(name, 1) for name in self.weights}
-        due = {name: weight for name, weight in self.weights.items() if number % every[name] == 0}
-        return {name: weight * every[name] for name, weight in due.items() if weight != 0}
+        every = {name: self.every.get(name, 1) for name, weight in self.weights.items() if weight != 0}
+        return {name: self.weights[name] * n for name, n in every.items() if number % n == 0}
 
 
 def parts(step: Step, factors: Mapping[str, float]) -> dict[str, tuple[Tensor, float]]:
     """Evaluate the terms of a step; return value and factor by name, without terms whose effect is off."""
     if missing := [name for name in factors if name not in step.terms]:
-        raise ValueError(
-            f"model: expected look to give the term '{missing[0]}', as the method's terms say, but got "
-            f"{', '.join(step.terms) or 'none'}"
-        )
+        expected = f"model: expected look to give the term '{missing[0]}', as the method's terms say"
+        raise ValueError(f"{expected}, but got {', '.join(step.terms) or 'none'}")
     values = {name: (step.terms[name](), factor) for name, factor in factors.items()}
     return {name: found for name, found in values.items() if found[0] is not None}  # None: an effect is off
 
@@ -85,17 +82,13 @@ def set_gradients(method: Method, gradients: Mapping[str, Tensor]) -> None:
     """
     parameters = dict(method.named_parameters())
     if not gradients or not gradients.keys() <= parameters.keys():
-        raise ValueError(
-            f"model: expected gradients of some of {', '.join(parameters)}, but got "
-            f"{', '.join(gradients) or 'none'}"
-        )
+        got = ", ".join(gradients) or "none"
+        raise ValueError(f"model: expected gradients of some of {', '.join(parameters)}, but got {got}")
     for name, value in gradients.items():
         parameter = parameters[name]
-        expected = parameter.shape, parameter.dtype, parameter.device
-        if (value.shape, value.dtype, value.device) != expected:
-            raise ValueError(
-                f"model: expected a gradient of {name} as it is, {tuple(parameter.shape)} {parameter.dtype} "
-                f"on {parameter.device}, but got {tuple(value.shape)} {value.dtype} on {value.device}"
-            )
+        wanted, got = ((tuple(t.shape), t.dtype, t.device) for t in (parameter, value))
+        if got != wanted:
+            wanted, got = ("{} {} on {}".format(*about) for about in (wanted, got))
+            raise ValueError(f"model: expected a gradient of {name} as it is, {wanted}, but got {got}")
         if parameter.requires_grad:
             parameter.grad = value

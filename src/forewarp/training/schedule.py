@@ -53,14 +53,10 @@ class StageSettings:
     def __post_init__(self) -> None:
         where = f"stage.{self.name}"
         if not isinstance(self.name, str) or not re.fullmatch(r"\w[\w-]*", self.name):
-            raise ValueError(
-                "stage: expected names of letters, digits, _ and -, as they name folders, "
-                f"but got {self.name!r}"
-            )
+            expected = "names of letters, digits, _ and -, as they name folders"
+            raise ValueError(f"stage: expected {expected}, but got {self.name!r}")
         if self.iterations is None and self.minutes is None:
-            raise ValueError(
-                f"{where}: expected iterations or minutes, but got neither; set budget.minutes=10"
-            )
+            raise ValueError(f"{where}: expected iterations or minutes, but got neither; set budget.minutes")
         for key in ("iterations", "minutes", "steps_per_picture"):
             if (bound := getattr(self, key)) is not None:
                 check_number(f"{where}.{key}", bound, "a number > 0, or null", lambda bound: bound > 0)
@@ -89,33 +85,22 @@ class StageSettings:
 
     def over(self, pictures: int) -> StageSettings:
         """Return the settings whose ``iterations`` also keep ``steps_per_picture``."""
-        return replace(self, iterations=most_steps(self.iterations, self.steps_per_picture, pictures))
+        per_picture = None if self.steps_per_picture is None else self.steps_per_picture * pictures
+        bounds = [max(1, round(bound)) for bound in (self.iterations, per_picture) if bound is not None]
+        return replace(self, iterations=min(bounds, default=None))
 
     def lr_factor(self, fraction: float, group: str) -> float:
         """Return what the learning rate of a group is multiplied by at ``fraction`` of the stage."""
         hold, last = self.lr_hold, self.lr_final_factor
         hold = hold.get(group, 0.0) if isinstance(hold, Mapping) else hold
         last = last.get(group, 1.0) if isinstance(last, Mapping) else last
-        if fraction <= hold:
-            return 1.0
-        return last ** ((min(1.0, fraction) - hold) / (1 - hold))
+        return 1.0 if fraction <= hold else last ** ((min(1.0, fraction) - hold) / (1 - hold))
 
     def fraction(self, steps: int, seconds: float) -> float:
         """Return the fraction done, in [0, 1]: of the iterations or of the minutes, whichever is larger."""
         by_steps = 0.0 if self.iterations is None else steps / self.iterations
         by_time = 0.0 if self.minutes is None else seconds / (60 * self.minutes)
         return min(1.0, max(by_steps, by_time))
-
-
-def most_steps(iterations: float | None, steps_per_picture: float | None, pictures: int) -> int | None:
-    """Return the steps after which a stage ends, whatever its minutes; None if they alone end it.
-
-    >>> most_steps(None, 1.5, 10), most_steps(12, 1.5, 10), most_steps(None, None, 10)
-    (15, 12, None)
-    """
-    per_picture = None if steps_per_picture is None else steps_per_picture * pictures
-    bounds = [max(1, round(bound)) for bound in (iterations, per_picture) if bound is not None]
-    return min(bounds, default=None)
 
 
 @dataclass(frozen=True)
@@ -144,28 +129,27 @@ class StagePlan:
 
 
 def share_out(
-    plans: Mapping[str, StagePlan | None], *, minutes: float | None, iterations: int | None
+    plans: Mapping[str, StagePlan], *, minutes: float | None, iterations: int | None
 ) -> list[Stage]:
     """Divide the run's minutes and iterations among its stages by their shares; keep their order.
 
     Args:
-        plans: by name; None leaves a stage out.
+        plans: by name.
         minutes, iterations: the run's budget; None: unbounded. With both, each stage ends at the first.
 
     Raises:
         ValueError: without any stage, for a share that is not > 0, or for a bound that is not > 0.
     """
-    kept = {name: plan for name, plan in plans.items() if plan is not None}
-    if not kept:
+    if not plans:
         raise ValueError("stage: expected at least one stage, but got none; leave one of them on")
-    for name, plan in kept.items():
+    for name, plan in plans.items():
         wanted = f"a number > 0, or ~stage.{name} to drop it"
         check_number(f"stage.{name}.share", plan.share, wanted, lambda share: share > 0)
     for key, bound in (("minutes", minutes), ("iterations", iterations)):
         if bound is not None:
             check_number(f"budget.{key}", bound, "a number > 0 or null", lambda bound: bound > 0)
-    whole, stages = sum(plan.share for plan in kept.values()), []
-    for name, plan in kept.items():
+    whole, stages = sum(plan.share for plan in plans.values()), []
+    for name, plan in plans.items():
         bounds = {
             "minutes": None if minutes is None else minutes * plan.share / whole,
             "iterations": None if iterations is None else max(1, round(iterations * plan.share / whole)),
@@ -230,21 +214,18 @@ class Curriculum:
         seed: int = 0,
         where: str = "stage.curriculum",
     ) -> None:
-        shares = all(0 <= share <= 1 for share in (all_in, newest_share, error_share, ends_share))
-        if not (start >= 1 and shares and 0 < newest_part <= 1):
-            raise ValueError(
-                f"{where}: expected start >= 1, all_in, newest_share, error_share and ends_share in [0, 1] "
-                f"and newest_part in (0, 1], but got {start=}, {all_in=}, {newest_share=}, {error_share=}, "
-                f"{ends_share=}, {newest_part=}"
-            )
+        shares = {"all_in": all_in, "newest_share": newest_share, "error_share": error_share}
+        shares |= {"ends_share": ends_share, "newest_part": newest_part}
+        if not (start >= 1 and all(0 <= share <= 1 for share in shares.values()) and newest_part > 0):
+            expected = f"{where}: expected start >= 1, {', '.join(shares)} in [0, 1] and newest_part > 0"
+            raise ValueError(f"{expected}, but got {start=}, {shares}")
         self.canonical_time = canonical_time
         self.order = sorted(range(len(times)), key=lambda i: (abs(times[i] - canonical_time), times[i], i))
         last_of_time = {times[i]: place for place, i in enumerate(self.order)}
         self._ends = [place + 1 for place in last_of_time.values()]  # frames in play, by number of times
-        if most is not None and most < 1:
-            raise ValueError(f"{where}.most: expected at least 1 or null, but got {most}")
-        if iterations_per_time is not None:
-            check_least(1, of=where, iterations_per_time=iterations_per_time)
+        for key, bound in (("most", most), ("iterations_per_time", iterations_per_time)):
+            if bound is not None:
+                check_least(1, of=where, **{key: bound})
         self._ends = self._ends[:most]
         self.start, self.all_in, self.from_zero = min(start, len(self._ends)), all_in, from_zero
         self.iterations_per_time = iterations_per_time
@@ -302,12 +283,8 @@ class Curriculum:
 
     def state_dict(self) -> dict:
         """Return the generator's state, how far the stage is and the frames' errors."""
-        return {
-            "generator": self.generator.get_state(),
-            "fraction": self.fraction,
-            "step": self.step,
-            "errors": self.errors.clone(),
-        }
+        done = {"fraction": self.fraction, "step": self.step, "errors": self.errors.clone()}
+        return {"generator": self.generator.get_state(), **done}
 
     def load_state_dict(self, state: dict) -> None:
         """Continue from a ``state_dict``."""

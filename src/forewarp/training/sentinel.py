@@ -177,25 +177,18 @@ class Sentinel(lightning.Callback):
                 return
         except OSError as error:  # say what was found all the same
             stored = f"{path} could not be written ({error.strerror or error})"
-        stage = f"stage.{module.settings.name}"
-        raise BrokenStep(
-            f"{stage}: expected finite numbers, but got {found} at step {self._number}, frame {frame} "
-            f"(time {self._batch.time:.4g}); {stored}; begin anew with "
-            f"lower {stage}.lr, or go on with resume={self.folder.parent} sentinel.skip=1"
-        )
+        key = f"stage.{module.settings.name}"
+        at = f"at step {self._number}, frame {frame} (time {self._batch.time:.4g})"
+        advice = f"begin anew with lower {key}.lr, or go on with resume={self.folder.parent} sentinel.skip=1"
+        raise BrokenStep(f"{key}: expected finite numbers, but got {found} {at}; {stored}; {advice}")
 
 
 def _plain(batch: Batch) -> list[dict]:
     """Return the observations of a batch as tensors and plain numbers."""
-    return [
-        {
-            "time": seen.moment.time,
-            "frame": seen.moment.frame,
-            "camera": seen.moment.camera,
-            "camera_to_world": seen.view.camera.camera_to_world,
-            "pixels": seen.view.indices,
-            "rgb": seen.rgb.cpu(),
-            "background": seen.background.cpu(),
-        }
-        for seen in (*batch.observations, *batch.instant)
-    ]
+    plain = []
+    for seen in (*batch.observations, *batch.instant):
+        moment, view = seen.moment, seen.view
+        about = {"time": moment.time, "frame": moment.frame, "camera": moment.camera}
+        about |= {"camera_to_world": view.camera.camera_to_world, "pixels": view.indices}
+        plain.append(about | {"rgb": seen.rgb.cpu(), "background": seen.background.cpu()})
+    return plain

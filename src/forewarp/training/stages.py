@@ -22,14 +22,7 @@ from forewarp.files import read_json, write_json
 from forewarp.methods.method import Model, Start, parameter_count
 from forewarp.scene.cloud import Handover
 from forewarp.scene.frame import Scene, instants_of
-from forewarp.training.checkpoints import (
-    KeepCheckpoint,
-    check_state,
-    load_handover,
-    load_weights,
-    make_handover,
-    save_handover,
-)
+from forewarp.training import checkpoints
 from forewarp.training.loggers import RunLoggers
 from forewarp.training.module import DynamicSceneModule
 from forewarp.training.schedule import Curriculum, Stage
@@ -106,10 +99,8 @@ class Run:
         """
         place = self.device
         if self.clock != "wall" and place.type != "cpu":
-            raise ValueError(
-                "budget.clock: expected wall, as processor time leaves out the GPU's, but got "
-                f"{self.clock!r}; set budget.clock=wall, or trainer=cpu"
-            )
+            expected = "budget.clock: expected wall, as processor time leaves out the GPU's"
+            raise ValueError(f"{expected}, but got {self.clock!r}; set budget.clock=wall, or trainer=cpu")
 
     def fit(self) -> DynamicSceneModule:
         """Train all stages that are not finished; return the module of the last one."""
@@ -132,12 +123,12 @@ class Run:
                 module = self._module(stage, module, handover, blank=blank)
             module.clock = Clock(self.clock) if blank else clock
             if done:
-                load_weights(module, folder / "last.ckpt")
+                checkpoints.load_weights(module, folder / "last.ckpt")
                 self.tell(f"{stage.settings.name}: finished before")
             else:
                 self._fit_stage(stage, module, handover, steps)
             steps += int(_done(folder)["steps"])
-            handover = load_handover(folder)
+            handover = checkpoints.load_handover(folder)
         return module
 
     def _check_ahead(self, stages: Sequence[Stage]) -> None:
@@ -157,14 +148,12 @@ class Run:
         self.datamodule.setup("test")
         for stage in self.stages:
             if not self.is_finished(stage):
-                raise ValueError(
-                    f"{self.stage_folder(stage)}: expected a finished stage, but got none; "
-                    "continue with forewarp-train"
-                )
+                expected = f"{self.stage_folder(stage)}: expected a finished stage"
+                raise ValueError(f"{expected}, but got none; continue with forewarp-train")
         *before, last = self.stages
-        handover = load_handover(self.stage_folder(before[-1])) if before else None
+        handover = checkpoints.load_handover(self.stage_folder(before[-1])) if before else None
         module = self._module(last, handover=handover, blank=True)
-        load_weights(module, self.stage_folder(last) / "last.ckpt")
+        checkpoints.load_weights(module, self.stage_folder(last) / "last.ckpt")
         return module
 
     def stage_folder(self, stage: Stage) -> Path:
@@ -175,7 +164,7 @@ class Run:
         """Return whether a stage was trained to its end and has written all its files."""
         folder = self.stage_folder(stage)
         try:
-            load_handover(folder)
+            checkpoints.load_handover(folder)
         except ValueError:
             return False
         return _done(folder) is not None and (folder / "last.ckpt").is_file()
@@ -209,25 +198,12 @@ class Run:
         scene: Scene = self.datamodule.scene
         seed = self.seed + self.stages.index(stage)
         settings, objective = stage.settings.over(len(scene.train)), stage.objective
-        curriculum = Curriculum(
-            instants_of(scene.train),
-            scene.canonical_time,
-            **{"seed": seed, "where": f"stage.{settings.name}.curriculum", **settings.curriculum},
-        )
-        start = Start(
-            scene,
-            settings.name,
-            settings.numbers,
-            curriculum.frames(),
-            handover,
-            None if before is None else before.method,
-            blank,
-            objective.weights,
-            objective.literal,
-            objective.photo_on,
-            self.start is not None,
-        )
-        method = (stage.model or self.model)(start)
+        options = {"seed": seed, "where": f"stage.{settings.name}.curriculum", **settings.curriculum}
+        curriculum = Curriculum(instants_of(scene.train), scene.canonical_time, **options)
+        carried = handover, None if before is None else before.method, blank
+        terms = objective.weights, objective.literal, objective.photo_on
+        given = scene, settings.name, settings.numbers, curriculum.frames(), *carried, *terms
+        method = (stage.model or self.model)(Start(*given, shares=self.start is not None))
         return DynamicSceneModule(
             method, objective=objective, settings=settings, curriculum=curriculum, seed=seed
         )
@@ -239,10 +215,10 @@ class Run:
         settings, folder = stage.settings, self.stage_folder(stage)
         last = folder / "last.ckpt"
         sentinel = Sentinel(folder, skip=self.skip)
-        keeper = KeepCheckpoint(last, self.checkpoint_seconds, sentinel.check)
+        keeper = checkpoints.KeepCheckpoint(last, self.checkpoint_seconds, sentinel.check)
         checkpoint, steps = last if last.is_file() else None, 0
         if checkpoint is not None:
-            steps, seconds = check_state(checkpoint, module)
+            steps, seconds = checkpoints.check_state(checkpoint, module)
             fraction = module.settings.fraction(steps, seconds)
             self.tell(f"{settings.name}: goes on at {fraction:.0%}, step {steps}")
         loggers, module.trackers = self.loggers.open(steps_before, steps), self.loggers
@@ -256,30 +232,21 @@ class Run:
             raise KeyboardInterrupt
         curriculum, most = module.curriculum, module.settings.iterations
         in_play, count = curriculum.in_play, len(curriculum.order)
+        name = settings.name
         if most != settings.iterations and module.global_step >= most:
-            self.tell(
-                f"{settings.name}: ended after {most:,} steps, {settings.steps_per_picture:g} for each of "
-                f"{count} training pictures; for as many as the budget has: "
-                f"stage.{settings.name}.steps_per_picture=null"
-            )
+            each = f"{settings.steps_per_picture:g} for each of {count} training pictures"
+            more = f"for as many as the budget has: stage.{name}.steps_per_picture=null"
+            self.tell(f"{name}: ended after {most:,} steps, {each}; {more}")
         if in_play < count and curriculum.iterations_per_time is not None:
-            self.tell(
-                f"{settings.name}: ended when {in_play} of {count} training images had come in; for all, set "
-                f"a larger budget, or stage.{settings.name}.curriculum.iterations_per_time=null"
-            )
+            more = f"for all, set a larger budget, or stage.{name}.curriculum.iterations_per_time=null"
+            self.tell(f"{name}: ended when {in_play} of {count} training images had come in; {more}")
         keeper.save(trainer)
-        save_handover(make_handover(module.method, self.datamodule.scene, before, in_play), folder)
-        done = {
-            "seconds": module.clock.seconds,
-            "clocks": module.clock.every,
-            "steps": module.global_step,
-            "parameters": parameter_count(module.method),
-            "frames_in_play": in_play,
-            "peak_memory_bytes": peak_memory_bytes(),
-            "skipped_steps": sentinel.skipped,
-            "commit": code,
-        }
-        write_json(folder / "done.json", done)
+        handover = checkpoints.make_handover(module.method, self.datamodule.scene, before, in_play)
+        checkpoints.save_handover(handover, folder)
+        clock, steps, parameters = module.clock, module.global_step, parameter_count(module.method)
+        done = {"seconds": clock.seconds, "clocks": clock.every, "steps": steps, "parameters": parameters}
+        done |= {"frames_in_play": in_play, "peak_memory_bytes": peak_memory_bytes()}
+        write_json(folder / "done.json", done | {"skipped_steps": sentinel.skipped, "commit": code})
         if keeper.asked:  # pressed after the stage's last step
             raise KeyboardInterrupt
 
