@@ -9,15 +9,14 @@ from PIL import Image
 pytest.importorskip("pycolmap", reason="no pycolmap; make install adds it")
 
 from forewarp.capture import rig
-from forewarp.capture.motion import Still
+from forewarp.capture.motion import Still, is_fixed
 from forewarp.capture.poses import Search
 from forewarp.capture.rig import (
-    Looks,
     Recording,
+    Taken,
     cameras_in,
     capture_rig,
     choose,
-    is_fixed,
     lost_of,
     offsets_of,
     recordings,
@@ -58,11 +57,8 @@ def test_offsets_are_given_in_order_or_by_name_also_of_cameras_left_out(wanted, 
     [
         ([0, 1], "offsets: expected one of each of 3 cameras, but got 2"),
         ({"a": 0, "x": 1}, "offsets: expected names of a, b, c, but got x"),
-        (
-            {"a": 0, "b": 1},
-            "offsets: expected one of each camera, but got none of c; leave it out",
-        ),
-        ([0, "x", 1], "offsets: expected seconds, but got 'x' of b"),
+        ({"a": 0, "b": 1}, "offsets: expected one of each camera, but got none of c; leave it out"),
+        ([0, "x", 1], "offsets: seconds of b: expected a number, but got 'x'"),
         ("clap", "offsets: expected seconds for each camera, sound, none or null, but got 'clap'"),
     ],
 )
@@ -170,11 +166,7 @@ def test_images_of_another_size_than_a_cameras_first_are_named(tmp_path):
         (["a.mp4", "b.mp4"], ["c"], "without: expected names of a, b, but got c"),
         (["a.mp4", "b.mp4"], ["b"], "without: expected at least two cameras left, but got 1 of 2"),
         (["a.mp4", "a.mkv"], [], "expected a video for each camera, but got a.mkv and a.mp4"),
-        (
-            ["a.mp4", "b.mp4"],
-            [],
-            r"expected many frames, but got another file; leave it out .*\[a\]",
-        ),
+        (["a.mp4", "b.mp4"], [], r"expected many frames, but got another file; leave it out .*\[a\]"),
     ],
 )
 def test_folders_that_are_no_rig_are_refused(tmp_path, files, without, says):
@@ -245,14 +237,13 @@ def test_a_camera_stands_though_something_moves_and_the_light_changes():
 
 
 def test_a_camera_with_poses_of_few_frames_is_lost_and_named():
-    names = {"a": ["a/1", "a/2", "a/3"], "b": ["b/1"], "c": ["c/1"]}
-    looks, matches = Looks(None, None, names, {}), {"a": (12, "b"), "b": (40, "c"), "c": (40, "b")}
+    looks = ["a/1", "a/2", "a/3"], ["b/1"], ["c/1"]
+    taken = [Taken(film, [], [], [], names) for film, names in zip(FILMS, looks)]
+    matches = {"a": (12, "b"), "b": (40, "c"), "c": (40, "b")}
     found = SimpleNamespace(cameras=dict.fromkeys(["a/2", "b/1", "c/1"]))
-    with pytest.raises(
-        ValueError, match=r"a: expected a camera .* but got 12 matches at most, with b; .*\[a\]"
-    ):
-        lost_of(FILMS, looks, found, matches, False)
-    assert lost_of(FILMS, looks, found, matches, True) == ["a"]
+    with pytest.raises(ValueError, match=r"a: expected a camera .* but got 12 matches at most, with b; .*\[a\]"):
+        lost_of(taken, found, matches, False)
+    assert lost_of(taken, found, matches, True) == ["a"]
     found.cameras.pop("b/1")
     with pytest.raises(ValueError, match=r"with b \(and b\); leave it out \(without=\[a,b\]\)"):
-        lost_of(FILMS, looks, found, matches, True)  # one camera is no rig
+        lost_of(taken, found, matches, True)  # one camera is no rig

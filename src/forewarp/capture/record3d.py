@@ -19,10 +19,10 @@ from reprlib import repr as short
 import numpy as np
 import torch
 
-from forewarp.capture.frames import Step, shrunk
+from forewarp.capture.frames import Step, write_smaller
 from forewarp.data.directions import opposite
 from forewarp.data.files import mismatch, number
-from forewarp.data.images import by, read_image, write_image
+from forewarp.data.images import by, read_image
 from forewarp.data.posed_video import PosedShot, write_scene
 from forewarp.files import folder_written_whole, write_json
 from forewarp.ops.gaussians import rotations
@@ -70,9 +70,7 @@ def capture_record3d(scan: Path, out: Path, step: Step, mark: str, frames: int |
                     (folder / "images").mkdir(exist_ok=True)
                     (folder / "images" / name).write_bytes(read.member(f"rgbd/{i}.jpg"))
                     pixels = read_image(folder / "images" / name, read.size)[..., :3].numpy()
-                    height, width = (n // _SMALLER for n in pixels.shape[:2])
-                    small = shrunk(pixels[: height * _SMALLER, : width * _SMALLER], height, width)
-                    write_image(folder / f"images_{_SMALLER}" / name, small)
+                    write_smaller(folder, name, pixels, _SMALLER)
                     time, evidence = (read.times[i] - first) / ((last - first) or 1.0), read.confidence(i)
                     camera = read.camera(i)
                     yield PosedShot(name, camera, pixels, time, depth=read.depth(i), confidence=evidence)
