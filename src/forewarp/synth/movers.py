@@ -261,11 +261,7 @@ def still_points(world: World, cameras: Sequence[Camera], rng: np.random.Generat
 
 
 def views_of(
-    world: World,
-    times: Sequence[float],
-    cameras: Sequence[Camera],
-    face: np.ndarray,
-    barycentric: np.ndarray,
+    world: World, times: Sequence[float], cameras: Sequence[Camera], face: np.ndarray, barycentric: np.ndarray
 ) -> np.ndarray:
     """Count the images (N,) that show surface points, which move with what they lie on.
 

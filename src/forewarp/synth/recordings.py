@@ -34,14 +34,7 @@ from forewarp.synth.movers import (
     still_points,
     views_of,
 )
-from forewarp.synth.raycast import (
-    SAMPLES_A_PROCESS,
-    Posed,
-    by_processes,
-    camera_rays,
-    render,
-    surface_points,
-)
+from forewarp.synth.raycast import SAMPLES_A_PROCESS, Posed, by_processes, camera_rays, render, surface_points
 from forewarp.synth.scenes import UP, check_numbers
 from forewarp.synth.walks import Walk, cameras_of, direction
 from forewarp.synth.world import World
