@@ -1,4 +1,3 @@
-import shutil
 from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
@@ -405,8 +404,7 @@ def test_the_cameras_of_a_rig_are_searched_from_other_pairs_until_all_are_found(
             return {0: Model(1), 1: Model(next(left))}
 
         monkeypatch.setattr(pycolmap, "incremental_mapping", mapping)
-        shutil.rmtree(tmp_path / "models", ignore_errors=True)
-        words = tmp_path / "a.db", tmp_path, tmp_path / "models", Search(), lambda done, total: None
+        words = tmp_path / "a.db", tmp_path, Search(), lambda done, total: None
         return poses.reconstruct(*words, names).count, angles
 
     pycolmap.Database.open(tmp_path / "a.db").close()

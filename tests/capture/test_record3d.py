@@ -101,13 +101,13 @@ def test_frames_may_be_fewer_and_have_times_and_lenses_of_their_own(tmp_path):
     [
         ({"poses": []}, "metadata: poses: expected a pose of each frame, but got none"),
         ({"poses": [[0.0] * 7] * 9}, r"poses\[0\]: expected a quaternion of length 1, but got 0"),
-        ({"poses": [[0.0] * 6] * 9}, "metadata: poses: expected 7 numbers for each frame, but got"),
+        ({"poses": [[0.0] * 6] * 9}, "metadata: poses: expected 7 numbers in each row, but got"),
         ({"K": [0.0] * 9}, "metadata: focal length of frame 0: expected above 0, but got 0"),
-        ({"K": [1.0]}, r"metadata: K: expected 9 numbers, but got \[1.0\]"),
+        ({"K": [1.0]}, r"metadata: K: expected a list of 9, but got \[1.0\]"),
         ({"dw": None}, "metadata: dw: expected a number"),
         ({"dw": 10**5}, r"metadata: dw: expected a number in \[1, 2048\], but got 100000"),
         ({"rgbd/4.depth": bytes(5000)}, "rgbd/4.depth: expected at most 4528 bytes, but got 5000"),
-        ({"frameTimestamps": [1.0]}, "frameTimestamps: expected a list of 9, as there are poses, but got"),
+        ({"frameTimestamps": [1.0]}, "frameTimestamps: expected a list of 9, but got"),
         ({"rgbd/4.depth": b"nothing"}, "rgbd/4.depth: expected data compressed by LZFSE, but got others"),
         (
             {"rgbd/4.depth": lzfse.compress(bytes(8))},

@@ -241,7 +241,9 @@ def test_a_camera_with_poses_of_few_frames_is_lost_and_named():
     taken = [Taken(film, [], [], [], names) for film, names in zip(FILMS, looks)]
     matches = {"a": (12, "b"), "b": (40, "c"), "c": (40, "b")}
     found = SimpleNamespace(cameras=dict.fromkeys(["a/2", "b/1", "c/1"]))
-    with pytest.raises(ValueError, match=r"a: expected a camera .* but got 12 matches at most, with b; .*\[a\]"):
+    with pytest.raises(
+        ValueError, match=r"a: expected a camera .* but got 12 matches at most, with b; .*\[a\]"
+    ):
         lost_of(taken, found, matches, False)
     assert lost_of(taken, found, matches, True) == ["a"]
     found.cameras.pop("b/1")

@@ -392,11 +392,6 @@ def read_mask(path: Path) -> np.ndarray:
     return read_image(path)[..., 0].numpy() == 0
 
 
-def resized_mask(mask: np.ndarray, size: Sequence[int]) -> np.ndarray:
-    """Give a mask (h, w) bool another ``size``, (width, height), by its nearest pixels."""
-    return cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
-
-
 def sharpness(grey: np.ndarray) -> float:
     """Measure how much fine detail an image (H, W) has: the mean square of its Laplacian.
 

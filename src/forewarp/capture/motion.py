@@ -217,6 +217,11 @@ def _errors(tracks: dict, cameras: Sequence[Camera]) -> tuple[np.ndarray, np.nda
     return errors.amin(0).numpy(), (count >= _LEAST).numpy()
 
 
+def resized_mask(mask: np.ndarray, size: Sequence[int]) -> np.ndarray:
+    """Give a mask (h, w) bool another ``size``, (width, height), by its nearest pixels."""
+    return cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
+
+
 def _whole(moves: np.ndarray, known: np.ndarray) -> np.ndarray:
     """Drop specks of a mask (h, w), give what is not known the value of the nearest that is, fill holes."""
 

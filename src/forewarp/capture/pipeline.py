@@ -109,8 +109,7 @@ def find_poses(work: Path, images: Frames, search: Search, step: Step, force: bo
             poses.match(database, search, progress)
     refuse_matches(database, images, force)
     with step("poses") as progress:
-        shutil.rmtree(work / "models", ignore_errors=True)
-        model = poses.reconstruct(database, images.folder, work / "models", search, progress)
+        model = poses.reconstruct(database, images.folder, search, progress)
     if model is None:
         refuse_poses(None, images, database)
     with step("adjustment") as progress:
@@ -205,9 +204,8 @@ def work_folder(out: Path, about: Mapping[str, object]) -> Iterator[Path]:
         taken = (work / TAKEN).exists()
         stays = taken or not (is_refusal or isinstance(error, ImportError))
         if is_refusal and taken:
-            raise ValueError(
-                f"{error}; what was found stays in {work}, from which the same command goes on"
-            ) from error
+            stay = f"what was found stays in {work}, from which the same command goes on"
+            raise ValueError(f"{error}; {stay}") from error
         raise
     finally:
         if not stays:  # under the lock: what another call begins afterwards is its own

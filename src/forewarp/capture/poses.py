@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -303,10 +304,8 @@ def burnt_in(database: Path) -> np.ndarray:
         camera = base.read_all_cameras()[0]
         size = np.array([camera.width, camera.height])
         unit, cell = max(1.0, size.max() / 640), -(-size.max() // _CELLS)
-        places = {
-            image.image_id: base.read_keypoints(image.image_id)[:, :2].clip(0, size - 1)
-            for image in base.read_all_images()
-        }
+        numbers = [image.image_id for image in base.read_all_images()]
+        places = {number: base.read_keypoints(number)[:, :2].clip(0, size - 1) for number in numbers}
         pairs = [pycolmap.pair_id_to_image_pair(key) for key in base.read_two_view_geometry_num_inliers()[0]]
         count, still_pairs, still, seen = 0, *np.zeros((3, *-(-size // cell)))
         for pair in pairs[:: max(1, len(pairs) // _BURNT_PAIRS)]:
@@ -384,19 +383,13 @@ def pairs_of(count: int, matching: str) -> list[tuple[int, int]]:
 
 
 def reconstruct(
-    database: Path,
-    images: Path,
-    folder: Path,
-    search: Search,
-    progress: Progress,
-    names: Sequence[str] | None = None,
+    database: Path, images: Path, search: Search, progress: Progress, names: Sequence[str] | None = None
 ) -> pycolmap.Reconstruction | None:
     """Find cameras and points; return the model of the most images, or None.
 
     Args:
         database: of features and matches.
         images: folder of the images.
-        folder: for what is found.
         search: how to search.
         progress: called with images done and all.
         names: of a rig, the images to find, of which two are a model; None: all. Its cameras are few and far
@@ -405,7 +398,8 @@ def reconstruct(
     with pycolmap.Database.open(database) as base:
         total = len(names or base.read_all_images())
     least, tries = (MIN_MODEL, _TRIES[:1]) if names is None else (2, _TRIES)
-    done, best = 1, None
+    done, best, folder = 1, None, database.with_name("models")
+    shutil.rmtree(folder, ignore_errors=True)
 
     def count() -> None:
         nonlocal done
@@ -413,19 +407,17 @@ def reconstruct(
         progress(min(done, total), total)
 
     for row, (angle, has_lens, seed) in enumerate(tries):
-        options = pycolmap.IncrementalPipelineOptions(
-            random_seed=search.seed + seed, num_threads=search.threads or -1, min_model_size=least
-        )
+        options, seed = pycolmap.IncrementalPipelineOptions(), search.seed + seed
+        options.num_threads, options.min_model_size = search.threads or -1, least
         options.image_names = list(names or ())
-        options.mapper.random_seed = options.triangulation.random_seed = search.seed + seed
+        options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = seed
         options.mapper.init_min_tri_angle = angle
         options.ba_refine_extra_params = options.mapper.abs_pose_refine_extra_params = has_lens
-        pycolmap.set_random_seed(search.seed + seed)
+        pycolmap.set_random_seed(seed)
         place, done = folder / str(row), 1
         place.mkdir(parents=True)
-        models = pycolmap.incremental_mapping(
-            database, images, place, options, initial_image_pair_callback=count, next_image_callback=count
-        )
+        told = {"initial_image_pair_callback": count, "next_image_callback": count}
+        models = pycolmap.incremental_mapping(database, images, place, options, **told)
         best = max((*filter(None, [best]), *models.values()), key=lambda m: m.num_reg_images(), default=None)
         if best is not None and best.num_reg_images() >= (_ALL if total > _FEW else 1.0) * total:
             break

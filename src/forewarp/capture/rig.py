@@ -21,7 +21,7 @@ import pycolmap
 
 from forewarp.capture import frames, poses, scene
 from forewarp.capture.frames import NO_MASKS, TAKEN, Frames, Progress, Step, read_mask, write_mask
-from forewarp.capture.motion import Still, is_fixed, moving_masks
+from forewarp.capture.motion import Still, is_fixed, moving_masks, resized_mask
 from forewarp.capture.pipeline import ABOUT, PICTURE, keep, kept, record, work_for
 from forewarp.capture.poses import Reconstruction, Search
 from forewarp.capture.sync import MOST as HEARD
@@ -333,9 +333,8 @@ def choose(
         for film, clock, mine, moments in zip(films, clocks, rows, nearest)
     ]
     if empty := [taken.film.name for taken in chosen if len(taken.rows) < 2]:
-        raise mismatch(
-            "videos", "frames in the common time", f"none of {empty[0]}", "leave it out (without=)"
-        )
+        got = f"none of {empty[0]}"
+        raise mismatch("videos", "frames in the common time", got, "leave it out (without=)")
     return chosen, why
 
 
@@ -516,7 +515,7 @@ def _look_at(work: _Work, mine: Taken, fixed: bool | None) -> dict:
     still = Still.of(images)
     write_image(looks / name, np.sort(images, axis=0)[len(images) // 2])
     polluted = np.mean([still.moves(image) for image in images], axis=0) >= _POLLUTED
-    moves = frames.resized_mask(polluted, size)
+    moves = resized_mask(polluted, size)
     if work.masks is not None:
         moves |= np.mean(work.given(film, few, size, "given"), axis=0) >= _POLLUTED
     write_mask(dark / f"{name}.png", moves)
@@ -547,9 +546,7 @@ def _poses(
     if before is not None and before[1]["names"] == names:
         return before[0], before[1]["error"], matches
     with step("poses") as progress:
-        models = work.folder / "models"
-        shutil.rmtree(models, ignore_errors=True)
-        model = poses.reconstruct(database, looks, models, search, progress, names)
+        model = poses.reconstruct(database, looks, search, progress, names)
     if model is None:
         got = f"{max(count for count, _ in matches.values())} matches between two at most"
         advice = "put textured things into the scene, or the cameras closer together"

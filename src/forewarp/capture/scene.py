@@ -12,16 +12,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from forewarp.capture.frames import (
-    Frames,
-    Progress,
-    Source,
-    read_mask,
-    resized_mask,
-    write_mask,
-    write_smaller,
-)
-from forewarp.capture.motion import moving_masks, resting_masks
+from forewarp.capture.frames import Frames, Progress, Source, read_mask, write_mask, write_smaller
+from forewarp.capture.motion import moving_masks, resized_mask, resting_masks
 from forewarp.capture.poses import Reconstruction
 from forewarp.data.images import by, common_header, read_image
 from forewarp.data.posed_video import SCALES, PosedShot, write_scene

@@ -13,14 +13,7 @@ from functools import lru_cache
 import numpy as np
 
 from forewarp.scene.camera import Camera
-from forewarp.synth.raycast import (
-    LIGHT_RADIUS,
-    Posed,
-    by_processes,
-    camera_rays,
-    shaded,
-    surface_points,
-)
+from forewarp.synth.raycast import LIGHT_RADIUS, Posed, by_processes, camera_rays, shaded, surface_points
 from forewarp.synth.shapes import Material, Part, box, sphere
 from forewarp.synth.vehicle import rotation, shift
 from forewarp.synth.world import (
