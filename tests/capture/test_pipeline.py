@@ -1,5 +1,3 @@
-from contextlib import nullcontext
-
 import pytest
 from filelock import FileLock
 
@@ -9,6 +7,7 @@ from forewarp.capture import pipeline
 from forewarp.capture.frames import Frames, Source
 from forewarp.capture.pipeline import capture, work_folder
 from forewarp.capture.poses import Search, TooFewRegistered
+from tests.support.captures import step
 
 ABOUT = {"video": "a.mp4", "frames": 12}
 
@@ -79,7 +78,6 @@ def test_a_film_whose_poses_fail_is_tried_with_more_frames(tmp_path, monkeypatch
 
     monkeypatch.setattr(pipeline, "take", take)
     monkeypatch.setattr(pipeline, "find_poses", find_poses)
-    step = lambda title: nullcontext(lambda done, total: None)  # noqa: E731
     for frames, expected in ((None, [200, 400]), (50, [50])):
         tried.clear()
         with pytest.raises(ValueError, match=f"few of {expected[-1]}"):

@@ -1,5 +1,4 @@
 import wave
-from contextlib import nullcontext
 from types import SimpleNamespace
 
 import numpy as np
@@ -23,11 +22,8 @@ from forewarp.capture.rig import (
     span_of,
 )
 from tests.capture.test_sync import tracks
+from tests.support.captures import step
 from tests.support.films import numbered, write_film
-
-
-def step(title):
-    return nullcontext(lambda done, total: None)
 
 
 def film(name, count=30, rate=30.0, start=0.0):
@@ -152,9 +148,7 @@ def test_images_of_another_size_than_a_cameras_first_are_named(tmp_path):
         for number in range(3):
             Image.new("RGB", (80 + (number == 2), 64)).save(tmp_path / name / f"{number}.png")
     film = recordings(tmp_path, None)[0]
-    with pytest.raises(
-        ValueError, match=r"2.png: expected 80 x 64 pixels as 0.png, but got 81 x 64; .*\[a\]"
-    ):
+    with pytest.raises(ValueError, match=r"2.png: expected 80 x 64 pixels as 0.png, but got 81 x 64;.*\[a\]"):
         list(film.pixels([2], None, None))
 
 
@@ -182,9 +176,7 @@ def test_the_span_is_where_all_film_or_else_most_do():
     *span, line = span_of([*long, film("short", 30)], np.array([0, 1, 2.0, 0.0]))
     assert span == pytest.approx([2.0, 299 / 30])
     assert line == "short film only a part of the time that the others share"
-    with pytest.raises(
-        ValueError, match=r"overlap in time, but got a until 9.97 s and b from 20.00 s on.*\[b\]"
-    ):
+    with pytest.raises(ValueError, match=r"in time, but got a until 9.97 s and b from 20.00 s on.*\[b\]"):
         span_of(long[:2], np.array([0, 20.0]))
 
 
