@@ -227,6 +227,8 @@ def frames_for(speeds: np.ndarray) -> tuple[int, str]:
     (150, 'what is fast moves by 2 pixels of 640 a frame')
     >>> frames_for(np.full(600, 0.5))
     (120, 'what is fast moves by 0.5 pixels of 640 a frame; 120 at least')
+    >>> frames_for(np.full(600, 30.0))
+    (300, 'what is fast moves by 30 pixels of 640 a frame; 300 at most')
     """
     found = len(speeds)
     if found <= SHORT:

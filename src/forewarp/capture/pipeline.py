@@ -99,13 +99,11 @@ def find_poses(work: Path, images: Frames, search: Search, step: Step, force: bo
             poses.match(database, search, progress, every)
         if every is not None:  # before the work that a refusal would waste
             refuse_matches(database, images, force)
-    was_found = (work / _BURNT).exists()
-    burnt = read_mask(work / _BURNT) if was_found else poses.burnt_in(database)
-    if burnt.any():
-        if not was_found:
-            write_mask(work / _BURNT, burnt)
+    if not (work / _BURNT).exists() and (burnt := poses.burnt_in(database)).any():
+        write_mask(work / _BURNT, burnt)
+    if (work / _BURNT).exists():
         with step("matches without what is burnt in") as progress:
-            poses.leave_out(database, burnt)
+            poses.leave_out(database, read_mask(work / _BURNT))
             poses.match(database, search, progress)
     refuse_matches(database, images, force)
     with step("poses") as progress:

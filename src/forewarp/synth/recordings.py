@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import wave
 from collections.abc import Callable, Iterator
 from contextlib import closing
 from dataclasses import dataclass
@@ -22,17 +21,7 @@ from forewarp.files import write_json
 from forewarp.scene.box import Box
 from forewarp.scene.camera import Camera, look_at
 from forewarp.scene.frame import middle_of
-from forewarp.synth.movers import (
-    HALL_HIGH,
-    HALL_LOW,
-    SHADOW_RAYS,
-    Film,
-    filmed,
-    hall,
-    moving_faces,
-    still_points,
-    views_of,
-)
+from forewarp.synth import movers
 from forewarp.synth.raycast import Posed, by_processes, camera_rays, counted, render, surface_points
 from forewarp.synth.scenes import UP, check_numbers
 from forewarp.synth.walks import Walk, cameras_of, direction, pinhole
@@ -112,9 +101,9 @@ def synthesize_multicam(
 
     def shots() -> Iterator[PosedShot]:
         times = [[time / seconds for time in clock.times] for clock in clocks]
-        images = filmed(views, times, seconds, samples_per_pixel, workers)
+        images = movers.filmed(views, times, seconds, samples_per_pixel, workers)
         for k, (view, clock) in enumerate(zip(views, clocks)):
-            name, film = f"cam{k:02d}", Film(next(images))
+            name, film = f"cam{k:02d}", movers.Film(next(images))
             for number, time in enumerate(times[k]):
                 image, moving = film.add(*next(images))
                 shot = f"{name}_{number:04d}.jpg"
@@ -125,9 +114,9 @@ def synthesize_multicam(
             write_video(folder / f"{name}.mp4", frames_of_film, fps=clock.rate, sound=sound)
             sound.unlink()
 
-    points = still_points(hall(seconds), views, np.random.default_rng([seed, _DRAWN]), POINTS)
+    points = movers.still_points(movers.hall(seconds), views, np.random.default_rng([seed, _DRAWN]), POINTS)
     told = {"seconds": seconds, "moving_from": "the program that made the film", "points": points}
-    limits = {"near": NEAR, "far": FAR, "aabb": Box(HALL_LOW, HALL_HIGH)}
+    limits = {"near": NEAR, "far": FAR, "aabb": Box(movers.HALL_LOW, movers.HALL_HIGH)}
     posed_video.write_scene(folder / TRUTH, counted(shots(), cameras * frames, progress), **limits, **told)
     if synchronised:
         write_poses(folder, views, near=NEAR, far=FAR)
@@ -183,16 +172,14 @@ def _clocks(count: int, frames: int, synchronised: bool, seed: int) -> list[Cloc
 
 def write_sound(path: Path, clock: Clock, clap: float, rng: np.random.Generator) -> None:
     """Write what a camera hears as WAV: noise of its own, and the clap at ``clap`` seconds for all."""
+    from scipy.io import wavfile  # slow to load
+
     since = clock.offset + np.arange(round(clock.frames / clock.rate * HERTZ)) / HERTZ - clap
     tones = sum(np.sin(2 * np.pi * tone * since) for tone in TONES) / len(TONES)
     heard = LOUD * np.where(since > 0, np.exp(-since.clip(0) / FADE) * tones, 0)
     samples = heard + NOISE * rng.normal(size=len(since))
     path.parent.mkdir(parents=True, exist_ok=True)
-    with wave.open(str(path), "wb") as file:
-        file.setnchannels(1)
-        file.setsampwidth(2)
-        file.setframerate(HERTZ)
-        file.writeframes((32767 * samples.clip(-1, 1)).astype("<i2").tobytes())
+    wavfile.write(path, HERTZ, (32767 * samples.clip(-1, 1)).astype("<i2"))
 
 
 def synthesize_iphone(
@@ -233,7 +220,7 @@ def synthesize_iphone(
     check_numbers(samples_per_pixel, workers, **numbers)
     whole(size, "size", 12, multiple=6)
     seconds, times = (frames - 1) / FPS, np.linspace(0, 1, frames).tolist()
-    world, shape = hall(seconds), (size, size * 4 // 3)
+    world, shape = movers.hall(seconds), (size, size * 4 // 3)
     cameras = cameras_of(WALK, times, seconds, shape, seed)
     phones = [_phone_beside(*place, shape) for place in BESIDE]
     moments = [*range(0, frames, beside)]
@@ -250,21 +237,22 @@ def synthesize_iphone(
             keypoints = _keypoints(world, times[t], cameras[t], *marks) if t in chosen else None
             yield RigShot(f"0_{t:05d}", t, 0, "train", cameras[t], rgb, depth=depth, keypoints=keypoints)
         of_phones = [[times[t] for t in moments]] * len(phones)
-        images = filmed(phones, of_phones, seconds, samples_per_pixel, workers)
+        images = movers.filmed(phones, of_phones, seconds, samples_per_pixel, workers)
         for k, phone in enumerate(phones, 1):
-            film, still = Film(next(images)), _seen_by(hall(seconds, has_movers=False), 0.0, phone)
-            counts = views_of(world, times, cameras, *still).reshape(shape[::-1])
+            still = _seen_by(movers.hall(seconds, has_movers=False), 0.0, phone)
+            counts = movers.views_of(world, times, cameras, *still).reshape(shape[::-1])
+            film = movers.Film(next(images))
             for t in moments:
                 rgb, moving = film.add(*next(images))
                 counted = counts.copy()
                 surface = _seen_by(world, times[t], phone, np.flatnonzero(moving))
-                counted[moving] = views_of(world, times, cameras, *surface)
+                counted[moving] = movers.views_of(world, times, cameras, *surface)
                 covisible = counted > max(LEAST_VIEWS, int(LEAST_SHARE * frames))
                 yield RigShot(f"{k}_{t:05d}", t, k, "val", phone, rgb, covisible=covisible)
 
     low, high, near, far = _space_of(world, times, cameras)
     center, scale = 0.5 * (low + high), 1 / float(np.linalg.norm(high - low))
-    points = still_points(world, some, _stream(seed, _DRAWN), POINTS)
+    points = movers.still_points(world, some, _stream(seed, _DRAWN), POINTS)
     order = [middle, *(time for time in times if time != middle)]
     truth = world.trajectories(*tracks, np.array(order))
     limits = {"center": center.tolist(), "scale": scale, "near": scale * near, "far": scale * far}
@@ -299,7 +287,7 @@ def _phone_beside(azimuth: float, rise: float, shape: tuple[int, int]) -> Camera
 
 def _whole(seconds: float, time: float, camera: Camera, samples: int) -> tuple[np.ndarray, np.ndarray]:
     """Do a job: the image (H, W, 3) uint8, and distances (H, W) along the rays."""
-    rgba, distance = render(hall(seconds), time, camera, samples, SHADOW_RAYS)
+    rgba, distance = render(movers.hall(seconds), time, camera, samples, movers.SHADOW_RAYS)
     return rgba[..., :3], distance
 
 
@@ -311,8 +299,8 @@ def _seen_by(world: World, time: float, camera: Camera, pixels: np.ndarray | Non
 
 def _marks(world: World, times, cameras, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """Choose the keypoints among points drawn on the movers: as many of each, those that most images show."""
-    face, barycentric = surface_points(world, CANDIDATES, cameras, rng, times[0], moving_faces(world))
-    counts, part = views_of(world, times, cameras, face, barycentric), world.part_of_face[face]
+    face, barycentric = surface_points(world, CANDIDATES, cameras, rng, times[0], movers.moving_faces(world))
+    counts, part = movers.views_of(world, times, cameras, face, barycentric), world.part_of_face[face]
     of_part = [np.flatnonzero(part == one) for one in np.unique(part)]
     ranked = [rows[np.argsort(-counts[rows], kind="stable")] for rows in of_part]
     best = np.concatenate([rows[: KEYPOINTS // len(ranked)] for rows in ranked])
@@ -322,7 +310,7 @@ def _marks(world: World, times, cameras, rng: np.random.Generator) -> tuple[np.n
 def _keypoints(world: World, time: float, camera: Camera, face, barycentric) -> np.ndarray:
     """Project points at a time: rows (J, 3) of x, y and 1, or of zeros where something hides it."""
     pixel, _ = camera.project(world.points(face, barycentric, time))
-    seen = views_of(world, [time], [camera], face, barycentric)[:, None]
+    seen = movers.views_of(world, [time], [camera], face, barycentric)[:, None]
     return np.concatenate([pixel.numpy() * seen, seen], -1)
 
 
