@@ -26,11 +26,12 @@ def work(out, about=ABOUT, error=None):
 def test_it_is_gone_at_the_end_and_the_next_call_keeps_what_it_begins(tmp_path, monkeypatch):
     """That may begin as soon as the lock is free; the folder of the one before is removed by then."""
     free, there = FileLock.release, []
-    monkeypatch.setattr(
-        FileLock,
-        "release",
-        lambda lock, *a, **k: (there.extend((tmp_path / "new").iterdir()), free(lock, *a, **k)),
-    )
+
+    def release(lock, *arguments, **options):
+        there.extend((tmp_path / "new").iterdir())
+        free(lock, *arguments, **options)
+
+    monkeypatch.setattr(FileLock, "release", release)
     assert work(tmp_path / "new" / "hand") == ["about.json"]
     assert there[:1] == [tmp_path / "new" / "hand"]
     assert [path.name for path in (tmp_path / "new").iterdir()] == ["hand"]

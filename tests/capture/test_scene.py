@@ -105,9 +105,8 @@ def test_facts_are_those_of_the_capture_and_are_told_with_advice():
     ours = [*found.cameras, "frame_000013.jpg", "frame_000014.jpg"]
     originals = {name: f"IMG {n}.jpg" for n, name in enumerate(ours, 1)}
     times = {name: float(n) for n, name in enumerate(ours)}
-    frames = Frames(
-        Path("pictures"), None, times, range(14), 14, 1.0, dict.fromkeys(times, (320, 240)), originals
-    )
+    sizes = dict.fromkeys(times, (320, 240))
+    frames = Frames(Path("pictures"), None, times, range(14), 14, 1.0, sizes, originals)
     limits = Limits(0.5, 2.0, Box((-1, -1, -1), (1, 2, 3)))
     facts = facts_of(Source(images=Path("p")), frames, found, limits, [2], 0.12)
     chord = 2 * 4 * np.sin(np.radians(70 / 11) / 2)

@@ -188,19 +188,16 @@ def write(
             yield PosedShot(name, cameras[i], pixels, time, moving=moving, resting=rests, **rig)
             progress(len(names) + i + 1, 2 * len(names))
 
-    options = {"near": limits.near, "far": limits.far, "aabb": limits.box} if limits else {}
-    if moving_from is not None:
-        options["moving_from"] = moving_from
-    if in_seconds:
-        options["seconds"] = times[-1] - times[0]
     if burnt is not None:
-        options["mask"] = MASK
         for scale in (1, *scales):
             height, width = (n // scale for n in burnt.shape)
             blocks = burnt[: height * scale, : width * scale].reshape(height, scale, width, scale)
             name = MASK if scale == 1 else MASK.replace("/", f"_{scale}/")
             write_mask(folder / name, blocks.any((1, 3)))
-    write_scene(folder, shots(), points=found.sure(), **options)
+    told = {"near": limits.near, "far": limits.far, "aabb": limits.box} if limits else {}
+    told |= {"moving_from": moving_from, "mask": None if burnt is None else MASK}
+    told["seconds"] = times[-1] - times[0] if in_seconds else None
+    write_scene(folder, shots(), points=found.sure(), **told)
     return scales, None if moving_from is None else share
 
 
