@@ -95,8 +95,8 @@ def synthesize_multicam(
         raise mismatch("synchronised", "true or false", repr(synchronised), "set synchronised")
     views = rig(cameras, size, seed)
     clocks = _clocks(cameras, frames, synchronised, seed)
-    seconds = max(clock.end for clock in clocks)
-    clap = max(clock.offset for clock in clocks) / 2 + min(clock.end for clock in clocks) / 2
+    ends = [clock.times[-1] for clock in clocks]
+    seconds, clap = max(ends), max(clock.offset for clock in clocks) / 2 + min(ends) / 2
     remove(folder, f"{TRUTH}.json", "cam*.mp4", "poses_bounds.npy")
 
     def shots() -> Iterator[PosedShot]:
@@ -155,19 +155,13 @@ class Clock:
         """Of the frames, seconds."""
         return [self.offset + number / self.rate for number in range(self.frames)]
 
-    @property
-    def end(self) -> float:
-        """Of the last frame, seconds."""
-        return self.times[-1]
-
 
 def _clocks(count: int, frames: int, synchronised: bool, seed: int) -> list[Clock]:
     if synchronised:
         return [Clock(0.0, RATES[1], frames)] * count
     latest = min(LATEST, LATEST_SHARE * (frames - 1) / RATES[1])
     offsets = np.random.default_rng([seed, _OFFSETS]).uniform(0, latest, count)
-    first = offsets.min()
-    return [Clock(float(at - first), RATES[k % 2], frames) for k, at in enumerate(offsets)]
+    return [Clock(float(at), RATES[k % 2], frames) for k, at in enumerate(offsets - offsets.min())]
 
 
 def write_sound(path: Path, clock: Clock, clap: float, rng: np.random.Generator) -> None:
