@@ -1,5 +1,3 @@
-from contextlib import nullcontext
-
 import pytest
 from filelock import FileLock
 
@@ -9,6 +7,7 @@ from forewarp.capture import pipeline
 from forewarp.capture.frames import Frames, Source
 from forewarp.capture.pipeline import capture, work_folder
 from forewarp.capture.poses import Search, TooFewRegistered
+from tests.support.captures import step
 
 ABOUT = {"video": "a.mp4", "frames": 12}
 
@@ -27,11 +26,12 @@ def work(out, about=ABOUT, error=None):
 def test_it_is_gone_at_the_end_and_the_next_call_keeps_what_it_begins(tmp_path, monkeypatch):
     """That may begin as soon as the lock is free; the folder of the one before is removed by then."""
     free, there = FileLock.release, []
-    monkeypatch.setattr(
-        FileLock,
-        "release",
-        lambda lock, *a, **k: (there.extend((tmp_path / "new").iterdir()), free(lock, *a, **k)),
-    )
+
+    def release(lock, *arguments, **options):
+        there.extend((tmp_path / "new").iterdir())
+        free(lock, *arguments, **options)
+
+    monkeypatch.setattr(FileLock, "release", release)
     assert work(tmp_path / "new" / "hand") == ["about.json"]
     assert there[:1] == [tmp_path / "new" / "hand"]
     assert [path.name for path in (tmp_path / "new").iterdir()] == ["hand"]
@@ -79,7 +79,6 @@ def test_a_film_whose_poses_fail_is_tried_with_more_frames(tmp_path, monkeypatch
 
     monkeypatch.setattr(pipeline, "take", take)
     monkeypatch.setattr(pipeline, "find_poses", find_poses)
-    step = lambda title: nullcontext(lambda done, total: None)  # noqa: E731
     for frames, expected in ((None, [200, 400]), (50, [50])):
         tried.clear()
         with pytest.raises(ValueError, match=f"few of {expected[-1]}"):

@@ -1,6 +1,5 @@
-import shutil
-from contextlib import nullcontext
 from dataclasses import replace
+from itertools import combinations
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -16,19 +15,11 @@ import pycolmap
 
 from forewarp.capture import pipeline, poses
 from forewarp.capture.frames import Frames
-from forewarp.capture.poses import (
-    Evidence,
-    Search,
-    adjust,
-    read_model,
-    refuse_matches,
-    refuse_poses,
-    unrotated,
-)
+from forewarp.capture.poses import Evidence, Search, adjust, read_model, refuse_matches, refuse_poses
 from forewarp.data.directions import inverted, opposite
 from forewarp.scene.camera import Lens
 from forewarp.synth.walks import cameras_of
-from tests.support.captures import WALKS, cameras_on_arc, pictures_of, sparse_arc, write_model
+from tests.support.captures import WALKS, cameras_on_arc, pictures_of, quiet, sparse_arc, step, write_model
 
 POINTS = np.random.default_rng(0).uniform(-1, 1, (40, 3))
 LENS = (0.05, -0.02, 0.001, -0.002)
@@ -79,9 +70,7 @@ def test_cameras_without_a_picture_are_left_out(tmp_path):
     assert list(found.cameras) == list(theirs)
     assert found.absent == list(cameras)[:1]
     assert set(found.seen[:, 0]) == set(range(5))
-    with pytest.raises(
-        ValueError, match="images: expected pictures as .*, as the model has, but got a.png; set"
-    ):
+    with pytest.raises(ValueError, match="images: expected pictures as .*, as the model has, but got a.png"):
         read_model(tmp_path / "sparse", {"a.png": "a.png"})
 
 
@@ -142,23 +131,19 @@ def test_one_poor_camera_does_not_keep_the_points_of_others(model):
     """The last camera has few points and no doubtful ones; one of the first sees a single doubtful point."""
     images, doubtful = model.reg_image_ids(), sorted(model.points3D)[:20]
     forget(model, images[0], doubtful[1:] + sorted(model.points3D)[35:])
-    adjust(model, Search(threads=1), lambda done, total: None)
+    adjust(model, Search(threads=1), quiet)
     assert set(doubtful) & set(model.points3D) == {doubtful[0]}
 
 
 def test_the_error_of_all_points_is_kept_for_the_next_call(model, tmp_path, monkeypatch):
     error = model.compute_mean_reprojection_error()
-    for name, result in (
-        ("find_features", None),
-        ("match", None),
-        ("burnt_in", np.zeros((2, 2), bool)),
-        ("reconstruct", model),
-    ):
+    results = {"find_features": None, "match": None, "burnt_in": np.zeros((2, 2), bool), "reconstruct": model}
+    for name, result in results.items():
         monkeypatch.setattr(poses, name, lambda *given, result=result: result)
     for name in ("refuse_matches", "refuse_poses"):
         monkeypatch.setattr(pipeline, name, lambda *given: None)
-    frames, quiet = SimpleNamespace(folder=None, masks=None, times=range(6)), lambda done, total: None
-    first = pipeline.find_poses(tmp_path, frames, Search(threads=1), lambda title: nullcontext(quiet))
+    frames = SimpleNamespace(folder=None, masks=None, times=range(6))
+    first = pipeline.find_poses(tmp_path, frames, Search(threads=1), step)
     again = pipeline.find_poses(tmp_path, frames, Search(threads=1), None)
     assert first.error == again.error == error
     assert len(first.points) == len(again.points) == 40
@@ -180,19 +165,17 @@ def matched(folder, turn=0.0, far=0, logo=0, count=6, size=(640, 480)):
         places.append(np.concatenate([world, burnt]).clip(0, np.array(size) - 1))
     path = folder / "database.db"
     with pycolmap.Database.open(path) as base:
-        camera = base.write_camera(
-            pycolmap.Camera(model="SIMPLE_PINHOLE", width=640, height=480, params=(500, 320, 240))
-        )
+        lens = pycolmap.Camera(model="SIMPLE_PINHOLE", width=640, height=480, params=(500, 320, 240))
+        camera = base.write_camera(lens)
         images = []
         for number, ends in enumerate(places):
             images.append(base.write_image(pycolmap.Image(name=f"{number}.png", camera_id=camera)))
             base.write_keypoints(images[-1], ends.astype(np.float32))
         every = np.arange(len(places[0]), dtype=np.uint32).repeat(2).reshape(-1, 2)
         geometry = pycolmap.TwoViewGeometry(config=3, inlier_matches=every[: 300 + far])
-        for i in range(count):
-            for j in range(i + 1, count):
-                base.write_matches(images[i], images[j], every)
-                base.write_two_view_geometry(images[i], images[j], geometry)
+        for pair in combinations(images, 2):
+            base.write_matches(*pair, every)
+            base.write_two_view_geometry(*pair, geometry)
     return path
 
 
@@ -224,7 +207,7 @@ def test_a_first_look_is_refused_before_the_rest(tmp_path, monkeypatch):
     frames = SimpleNamespace(folder=None, masks=None, times=range(50))
     for force, error in ((False, ZeroDivisionError), (True, TypeError)):  # there is no database
         with pytest.raises(error):
-            pipeline.find_poses(tmp_path, frames, Search(), lambda title: nullcontext(None), force)
+            pipeline.find_poses(tmp_path, frames, Search(), step, force)
     assert looks == [4, 4, 4, 4, None, None]
 
 
@@ -234,7 +217,7 @@ def test_images_keep_their_numbers_whatever_is_looked_at_first(tmp_path):
     pixels = np.random.default_rng(0).integers(0, 256, (12, 16, 3), np.uint8).repeat(8, 0).repeat(8, 1)
     for number in range(6):
         Image.fromarray(np.roll(pixels, 5 * number, 1)).save(tmp_path / "images" / f"{number}.png")
-    search, quiet = Search(threads=1, features=200), lambda done, total: None
+    search = Search(threads=1, features=200)
     for every, looked_at, pairs in ((2, {1, 3, 5}, 3), (None, {1, 2, 3, 4, 5, 6}, 15)):
         database = poses.find_features(tmp_path, tmp_path / "images", None, search, quiet, every)
         poses.match(database, search, quiet, every)
@@ -251,7 +234,7 @@ def database_of(folder, images):
     (folder / "images").mkdir(parents=True)
     for number, pixels in enumerate(images):
         Image.fromarray(pixels).save(folder / "images" / f"{number:02d}.png")
-    search, quiet = Search(threads=1), lambda done, total: None
+    search = Search(threads=1)
     database = poses.find_features(folder, folder / "images", None, search, quiet)
     poses.match(database, search, quiet)
     return database
@@ -263,9 +246,8 @@ def test_a_logo_in_a_film_is_found_and_the_film_without_has_none(tmp_path):
     cameras = cameras_of(WALKS["room"], times, 3.0, (320, 240))
     images = np.stack(list(pictures_of(WALKS["room"], times, cameras, samples=1, workers=1)))
     assert not poses.burnt_in(database_of(tmp_path / "clean", images)).any()
-    images[:, 10:58, 230:310] = (
-        np.random.default_rng(0).integers(0, 256, (8, 10, 3)).repeat(6, 0).repeat(8, 1)
-    )
+    logo = np.random.default_rng(0).integers(0, 256, (8, 10, 3))
+    images[:, 10:58, 230:310] = logo.repeat(6, 0).repeat(8, 1)
     burnt = poses.burnt_in(database_of(tmp_path / "logo", images))
     assert burnt[10:58, 230:310].mean() > 0.9
     assert burnt.mean() < 0.15
@@ -320,24 +302,12 @@ def test_good_matches_and_poses_pass_and_of_known_poses_three_are_enough(monkeyp
 @pytest.mark.parametrize(
     ("found", "given", "says"),
     [
-        (
-            None,
-            {},
-            r"12 pictures registered, but got 0; film slower and .*, take more frames \(frames=\), or",
-        ),
+        (None, {}, r"12 pictures registered, but got 0; film slower .*, take more frames \(frames=\), or"),
         ({"count": 5}, {}, "most of 12 pictures registered, but got 5; film slower and with more"),
         ({"count": 5}, {"edges": 4.0}, "but got 5; edges are 4 pixels wide"),
         (None, {"originals": {"picture_000001.jpg": "a.jpg"}}, "0; .*, take more pictures, or give"),
-        (
-            {},
-            {"size": (640, 480)},
-            "cameras of 640 x 480 pixels, as the pictures, but got 320 x 240; set images=",
-        ),
-        (
-            {"focal": 60.0},
-            {},
-            "at most 130 degrees, but got 139; if it is a fisheye, .* before something flat",
-        ),
+        ({}, {"size": (640, 480)}, "of 640 x 480 pixels, as the pictures, but got 320 x 240; set images="),
+        ({"focal": 60.0}, {}, "at most 130 degrees, but got 139; if it is a fisheye, .* something flat"),
         ({"lens": Lens((-2.0, 0.0, 0.0))}, {}, "a lens that can be undone .* if it is a fisheye"),
         ({"degrees": 0.1}, {}, "places that are 0.08 % of the distance apart; .* before something flat"),
         ({"error": 3.0}, {}, "reprojection error of at most 2.5 pixels, but got 3.0"),
@@ -353,10 +323,8 @@ def placed_anew(change, **options):
     """A known model, its poses (12, 4, 4) changed, without points."""
     found = sparse_arc(**options)
     poses = change(torch.stack([camera.camera_to_world for camera in found.cameras.values()]))
-    cameras = {
-        name: replace(camera, camera_to_world=pose)
-        for (name, camera), pose in zip(found.cameras.items(), poses)
-    }
+    pairs = zip(found.cameras.items(), poses)
+    cameras = {name: replace(camera, camera_to_world=pose) for (name, camera), pose in pairs}
     return replace(found, cameras=cameras, points=found.points[:0], seen=found.seen[:0])
 
 
@@ -383,18 +351,14 @@ def test_turning_and_walking_are_told_apart(moves, least, most):
     rotation = Rotation.from_euler("xyz", [2, 6, 1], degrees=True).as_matrix()
     ends = [1.2 * seen[:, :2] / seen[:, 2:] for seen in (points, (points - [moves, 0, 0]) @ rotation.T)]
     ends[1][:100] += rng.normal(size=(100, 2))
-    assert least <= min(unrotated(*ends, focal) for focal in (1.0, 1.2, 1.6)) <= most
+    assert least <= min(poses.unrotated(*ends, focal) for focal in (1.0, 1.2, 1.6)) <= most
 
 
 def test_the_cameras_of_a_rig_are_searched_from_other_pairs_until_all_are_found(tmp_path, monkeypatch):
     """The first model of all cameras is taken, and else that of the most."""
 
-    class Model:
-        def __init__(self, count):
-            self.count = count
-
-        def num_reg_images(self):
-            return self.count
+    def model(count):
+        return SimpleNamespace(num_reg_images=lambda: count)
 
     def searched(counts, names):
         left, angles = iter(counts), []
@@ -402,12 +366,11 @@ def test_the_cameras_of_a_rig_are_searched_from_other_pairs_until_all_are_found(
         def mapping(database, images, place, options, **calls):
             assert place.is_dir()
             angles.append(options.mapper.init_min_tri_angle)
-            return {0: Model(1), 1: Model(next(left))}
+            return {0: model(1), 1: model(next(left))}
 
         monkeypatch.setattr(pycolmap, "incremental_mapping", mapping)
-        shutil.rmtree(tmp_path / "models", ignore_errors=True)
-        words = tmp_path / "a.db", tmp_path, tmp_path / "models", Search(), lambda done, total: None
-        return poses.reconstruct(*words, names).count, angles
+        words = tmp_path / "a.db", tmp_path, Search(), quiet
+        return poses.reconstruct(*words, names).num_reg_images(), angles
 
     pycolmap.Database.open(tmp_path / "a.db").close()
     assert searched([2, 4, 3], list("abcd")) == (4, [16.0, 16.0])

@@ -3,7 +3,6 @@
 import io
 import json
 import zipfile
-from contextlib import nullcontext
 
 import numpy as np
 import pytest
@@ -18,6 +17,7 @@ import lzfse
 from forewarp.capture.record3d import capture_record3d, summary
 from forewarp.data.files import SceneError
 from forewarp.data.posed_video import read_scene
+from tests.support.captures import step
 
 SIZE, DEPTH = (36, 48), (9, 12)  # width, height
 
@@ -37,9 +37,8 @@ def write_scan(path, count=9, **changes):
     rng, files = np.random.default_rng(0), {}
     for i in range(count):
         image, depth = io.BytesIO(), np.full(DEPTH[::-1], 3 + 0.1 * i, np.float32)
-        Image.fromarray(rng.integers(0, 256, (*SIZE[::-1], 3), dtype=np.uint8)).save(
-            image, "JPEG", quality=95
-        )
+        pixels = rng.integers(0, 256, (*SIZE[::-1], 3), dtype=np.uint8)
+        Image.fromarray(pixels).save(image, "JPEG", quality=95)
         depth[0, :3] = [np.nan, 0, -1]
         trust = np.full(depth.shape, 2, np.uint8)
         trust[1, :2] = [0, 1]
@@ -57,9 +56,7 @@ def write_scan(path, count=9, **changes):
 
 
 def captured(scan, out, **options):
-    return capture_record3d(
-        scan, out, lambda title: nullcontext(lambda *done: None), "capture.json", **options
-    )
+    return capture_record3d(scan, out, step, "capture.json", **options)
 
 
 def test_a_scan_becomes_a_scene_with_its_poses_and_depth(tmp_path):
@@ -101,18 +98,15 @@ def test_frames_may_be_fewer_and_have_times_and_lenses_of_their_own(tmp_path):
     [
         ({"poses": []}, "metadata: poses: expected a pose of each frame, but got none"),
         ({"poses": [[0.0] * 7] * 9}, r"poses\[0\]: expected a quaternion of length 1, but got 0"),
-        ({"poses": [[0.0] * 6] * 9}, "metadata: poses: expected 7 numbers for each frame, but got"),
+        ({"poses": [[0.0] * 6] * 9}, "metadata: poses: expected 7 numbers in each row, but got"),
         ({"K": [0.0] * 9}, "metadata: focal length of frame 0: expected above 0, but got 0"),
-        ({"K": [1.0]}, r"metadata: K: expected 9 numbers, but got \[1.0\]"),
+        ({"K": [1.0]}, r"metadata: K: expected a list of 9, but got \[1.0\]"),
         ({"dw": None}, "metadata: dw: expected a number"),
         ({"dw": 10**5}, r"metadata: dw: expected a number in \[1, 2048\], but got 100000"),
         ({"rgbd/4.depth": bytes(5000)}, "rgbd/4.depth: expected at most 4528 bytes, but got 5000"),
-        ({"frameTimestamps": [1.0]}, "frameTimestamps: expected a list of 9, as there are poses, but got"),
+        ({"frameTimestamps": [1.0]}, "frameTimestamps: expected a list of 9, but got"),
         ({"rgbd/4.depth": b"nothing"}, "rgbd/4.depth: expected data compressed by LZFSE, but got others"),
-        (
-            {"rgbd/4.depth": lzfse.compress(bytes(8))},
-            "4.depth: expected 9 x 12 numbers as dw and dh say, but got 8",
-        ),
+        ({"rgbd/4.depth": lzfse.compress(bytes(8))}, "4.depth: expected 9 x 12 numbers as dw and dh say"),
         ({"rgbd/4.jpg": None}, "rgbd/4.jpg: expected this file in the archive, but got none"),
         ({"w": 40}, "000000.jpg: expected 40 x 48 pixels, but got 36 x 48"),
     ],

@@ -1,34 +1,19 @@
-import wave
-from contextlib import nullcontext
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from PIL import Image
+from scipy.io import wavfile
 
 pytest.importorskip("pycolmap", reason="no pycolmap; make install adds it")
 
 from forewarp.capture import rig
-from forewarp.capture.motion import Still
+from forewarp.capture.motion import Still, is_fixed
 from forewarp.capture.poses import Search
-from forewarp.capture.rig import (
-    Looks,
-    Recording,
-    cameras_in,
-    capture_rig,
-    choose,
-    is_fixed,
-    lost_of,
-    offsets_of,
-    recordings,
-    span_of,
-)
+from forewarp.capture.rig import Recording, Taken, choose, lost_of, offsets_of, recordings, span_of
 from tests.capture.test_sync import tracks
+from tests.support.captures import step
 from tests.support.films import numbered, write_film
-
-
-def step(title):
-    return nullcontext(lambda done, total: None)
 
 
 def film(name, count=30, rate=30.0, start=0.0):
@@ -58,11 +43,8 @@ def test_offsets_are_given_in_order_or_by_name_also_of_cameras_left_out(wanted, 
     [
         ([0, 1], "offsets: expected one of each of 3 cameras, but got 2"),
         ({"a": 0, "x": 1}, "offsets: expected names of a, b, c, but got x"),
-        (
-            {"a": 0, "b": 1},
-            "offsets: expected one of each camera, but got none of c; leave it out",
-        ),
-        ([0, "x", 1], "offsets: expected seconds, but got 'x' of b"),
+        ({"a": 0, "b": 1}, "offsets: expected one of each camera, but got none of c; leave it out"),
+        ([0, "x", 1], "offsets: seconds of b: expected a number, but got 'x'"),
         ("clap", "offsets: expected seconds for each camera, sound, none or null, but got 'clap'"),
     ],
 )
@@ -79,9 +61,7 @@ def test_offsets_of_numbered_images_need_a_rate():
 def with_sound(path, sound):
     """A film with a track of 8000 samples a second."""
     file = path.with_suffix(".wav")
-    with wave.open(str(file), "wb") as wav:
-        wav.setparams((1, 2, 8000, 0, "NONE", ""))
-        wav.writeframes((32767 * np.clip(sound, -1, 1)).astype("<i2").tobytes())
+    wavfile.write(file, 8000, (32767 * np.clip(sound, -1, 1)).astype("<i2"))
     write_film(path, numbered(10), inputs=["-i", str(file), "-c:a", "aac"])
 
 
@@ -144,10 +124,10 @@ def test_what_is_left_out_is_not_looked_at(tmp_path):
     for name in "ac":
         write_film(tmp_path / f"{name}.mp4", numbered(3))
     (tmp_path / "b.mp4").write_bytes(b"no film")
-    assert list(cameras_in(tmp_path)) == ["a", "b", "c"]
+    assert list(rig.cameras_in(tmp_path)) == ["a", "b", "c"]
     assert [one.name for one in recordings(tmp_path, None, ["b"])] == ["a", "c"]
     with pytest.raises(ValueError, match="offsets: expected one of each of 3 cameras, but got 1"):
-        capture_rig(tmp_path, tmp_path.parent / "out", Search(), step, without=["b"], offsets=[0])
+        rig.capture_rig(tmp_path, tmp_path.parent / "out", Search(), step, without=["b"], offsets=[0])
 
 
 def test_images_of_another_size_than_a_cameras_first_are_named(tmp_path):
@@ -156,9 +136,7 @@ def test_images_of_another_size_than_a_cameras_first_are_named(tmp_path):
         for number in range(3):
             Image.new("RGB", (80 + (number == 2), 64)).save(tmp_path / name / f"{number}.png")
     film = recordings(tmp_path, None)[0]
-    with pytest.raises(
-        ValueError, match=r"2.png: expected 80 x 64 pixels as 0.png, but got 81 x 64; .*\[a\]"
-    ):
+    with pytest.raises(ValueError, match=r"2.png: expected 80 x 64 pixels as 0.png, but got 81 x 64;.*\[a\]"):
         list(film.pixels([2], None, None))
 
 
@@ -170,11 +148,7 @@ def test_images_of_another_size_than_a_cameras_first_are_named(tmp_path):
         (["a.mp4", "b.mp4"], ["c"], "without: expected names of a, b, but got c"),
         (["a.mp4", "b.mp4"], ["b"], "without: expected at least two cameras left, but got 1 of 2"),
         (["a.mp4", "a.mkv"], [], "expected a video for each camera, but got a.mkv and a.mp4"),
-        (
-            ["a.mp4", "b.mp4"],
-            [],
-            r"expected many frames, but got another file; leave it out .*\[a\]",
-        ),
+        (["a.mp4", "b.mp4"], [], r"expected many frames, but got another file; leave it out .*\[a\]"),
     ],
 )
 def test_folders_that_are_no_rig_are_refused(tmp_path, files, without, says):
@@ -190,9 +164,7 @@ def test_the_span_is_where_all_film_or_else_most_do():
     *span, line = span_of([*long, film("short", 30)], np.array([0, 1, 2.0, 0.0]))
     assert span == pytest.approx([2.0, 299 / 30])
     assert line == "short film only a part of the time that the others share"
-    with pytest.raises(
-        ValueError, match=r"overlap in time, but got a until 9.97 s and b from 20.00 s on.*\[b\]"
-    ):
+    with pytest.raises(ValueError, match=r"in time, but got a until 9.97 s and b from 20.00 s on.*\[b\]"):
         span_of(long[:2], np.array([0, 20.0]))
 
 
@@ -245,14 +217,13 @@ def test_a_camera_stands_though_something_moves_and_the_light_changes():
 
 
 def test_a_camera_with_poses_of_few_frames_is_lost_and_named():
-    names = {"a": ["a/1", "a/2", "a/3"], "b": ["b/1"], "c": ["c/1"]}
-    looks, matches = Looks(None, None, names, {}), {"a": (12, "b"), "b": (40, "c"), "c": (40, "b")}
+    looks = ["a/1", "a/2", "a/3"], ["b/1"], ["c/1"]
+    taken = [Taken(film, [], [], [], names) for film, names in zip(FILMS, looks)]
+    matches = {"a": (12, "b"), "b": (40, "c"), "c": (40, "b")}
     found = SimpleNamespace(cameras=dict.fromkeys(["a/2", "b/1", "c/1"]))
-    with pytest.raises(
-        ValueError, match=r"a: expected a camera .* but got 12 matches at most, with b; .*\[a\]"
-    ):
-        lost_of(FILMS, looks, found, matches, False)
-    assert lost_of(FILMS, looks, found, matches, True) == ["a"]
+    with pytest.raises(ValueError, match=r"a: expected a camera .* 12 matches at most, with b; .*\[a\]"):
+        lost_of(taken, found, matches, False)
+    assert lost_of(taken, found, matches, True) == ["a"]
     found.cameras.pop("b/1")
     with pytest.raises(ValueError, match=r"with b \(and b\); leave it out \(without=\[a,b\]\)"):
-        lost_of(FILMS, looks, found, matches, True)  # one camera is no rig
+        lost_of(taken, found, matches, True)  # one camera is no rig

@@ -12,7 +12,7 @@ from forewarp.capture.scene import Limits, draw, facts_of, limits_of, placed, su
 from forewarp.data.images import write_image
 from forewarp.data.posed_video import read_scene
 from forewarp.scene.box import Box
-from tests.support.captures import cameras_on_arc, pose_errors, sparse_arc
+from tests.support.captures import cameras_on_arc, pose_errors, quiet, sparse_arc
 
 ROTATION = Rotation.from_euler("xyz", [40, -70, 110], degrees=True).as_matrix()
 ANYWHERE = (ROTATION, np.array([7.0, -3.0, 100.0]), 0.02)  # a world as structure from motion leaves it
@@ -105,9 +105,8 @@ def test_facts_are_those_of_the_capture_and_are_told_with_advice():
     ours = [*found.cameras, "frame_000013.jpg", "frame_000014.jpg"]
     originals = {name: f"IMG {n}.jpg" for n, name in enumerate(ours, 1)}
     times = {name: float(n) for n, name in enumerate(ours)}
-    frames = Frames(
-        Path("pictures"), None, times, range(14), 14, 1.0, dict.fromkeys(times, (320, 240)), originals
-    )
+    sizes = dict.fromkeys(times, (320, 240))
+    frames = Frames(Path("pictures"), None, times, range(14), 14, 1.0, sizes, originals)
     limits = Limits(0.5, 2.0, Box((-1, -1, -1), (1, 2, 3)))
     facts = facts_of(Source(images=Path("p")), frames, found, limits, [2], 0.12)
     chord = 2 * 4 * np.sin(np.radians(70 / 11) / 2)
@@ -138,7 +137,7 @@ def test_what_is_burnt_in_is_said_and_no_frame_trains_on_it(tmp_path):
     burnt = np.zeros((240, 320), bool)
     burnt[10:50, 260:310] = True
     limits = limits_of(found)
-    source, quiet = Source(video=Path("a.mp4")), lambda done, total: None
+    source = Source(video=Path("a.mp4"))
     written = write(tmp_path / "hand", source, frames, found, limits, quiet, burnt)
     for scale in (1, 2):
         scene = read_scene(tmp_path, "hand", scale=scale)

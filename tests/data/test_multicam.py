@@ -17,7 +17,6 @@ from forewarp.data.multicam import FILE, read_scene, write_poses
 from forewarp.data.rigs import held_cameras
 from forewarp.scene.box import Box
 from forewarp.scene.camera import Camera
-from forewarp.synth.films import write_scene
 from tests.support.films import numbered, write_film
 from tests.support.written_scenes import fixed_cameras, grey, placed, write_multicam
 
@@ -285,6 +284,3 @@ def test_films_of_two_rates_or_none_at_all_are_refused(films, tmp_path):
 def test_cameras_that_the_layout_cannot_tell_are_not_written(tmp_path, change):
     with pytest.raises(SceneError, match="camera 0: expected square pixels, the principal point"):
         write_poses(tmp_path, [replace(CAMERAS[0], **change)], near=1, far=2)
-    odd = replace(CAMERAS[0], width=47, cx=23.5)
-    with pytest.raises(SceneError, match="cam00.mp4: expected even sides, but got 47 x 32"):
-        write_scene(tmp_path, [odd], [[]], near=1, far=2)

@@ -3,6 +3,7 @@ found cameras come to true ones.
 """
 
 import math
+from contextlib import nullcontext
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,6 +15,16 @@ from forewarp.scene.camera import Camera, Lens, look_at
 from forewarp.synth.raycast import render_all
 from forewarp.synth.walks import Walk
 from forewarp.synth.world import World
+
+
+def quiet(done, total):
+    """Hear progress and say nothing."""
+    assert 0 <= done <= total
+
+
+def step(title):
+    """Give what hears of a step."""
+    return nullcontext(quiet)
 
 
 @dataclass(frozen=True)

@@ -39,3 +39,14 @@ def numbered(count, size=(48, 64), step=8):
     frames = np.zeros((count, *size, 3), np.uint8) + grey
     frames[:, : size[0] // 2, : size[1] // 2] = 250
     return frames
+
+
+def write_planes(path, planes, kind, *words, count=3):
+    """Write ``count`` times an image of planes (3, H, W) of a pixel format of ffmpeg's; ``words`` are of the
+    output.
+    """
+    _, height, width = planes.shape
+    raw = ["-f", "rawvideo", "-pix_fmt", kind, "-s", f"{width}x{height}", "-i", "-"]
+    call = [imageio_ffmpeg.get_ffmpeg_exe(), "-v", "error", *raw, *words, str(path)]
+    subprocess.run(call, input=count * planes.tobytes(), check=True)
+    return path

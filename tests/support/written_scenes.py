@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 import torch
 
-from forewarp.data import dnerf, hypernerf, nhr, posed_video
+from forewarp.data import dnerf, hypernerf, multicam, nhr, posed_video
+from forewarp.drawing import images
 from forewarp.scene.camera import Camera, Lens, look_at
 from forewarp.scene.frame import Truth
-from forewarp.synth.films import write_scene as write_films
 
 _REAL = Path(os.environ.get("FOREWARP_DATA", Path(__file__).parents[3] / "shared" / "data"))
 GONE = object()
@@ -273,8 +273,10 @@ def grey(camera, number, view) -> np.ndarray:
     return image
 
 
-def write_multicam(folder: Path, cameras, count=6, **options) -> Path:
+def write_multicam(folder: Path, cameras, count=6) -> Path:
     """Films of six frames by each camera."""
-    films = ([grey(camera, n, k) for n in range(count)] for k, camera in enumerate(cameras))
-    write_films(folder, cameras, films, **{"near": 14.0, "far": 30.0} | options)
+    for k, camera in enumerate(cameras):
+        film = (torch.from_numpy(grey(camera, n, k)).float() / 255 for n in range(count))
+        images.write_video(folder / f"cam{k:02d}.mp4", film, fps=30.0)
+    multicam.write_poses(folder, cameras, near=14.0, far=30.0)
     return folder

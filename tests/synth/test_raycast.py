@@ -102,12 +102,13 @@ def test_the_number_of_processes_does_not_matter(monkeypatch, world, kind):
         list(render_all([(world, "noon", CAMERAS[0])], workers=2))
 
 
-@pytest.mark.parametrize(("samples", "expected"), [(1, 1), (6, 1), (9, 2), (100, 3)])
+@pytest.mark.parametrize(("samples", "expected"), [(1, []), (6, []), (9, [2]), (100, [3])])
 def test_processes_are_for_much_work_and_never_more_than_processors(monkeypatch, world, samples, expected):
+    begun = []
+    pool = lambda workers, *_: begun.append(workers) or ThreadPoolExecutor(workers)  # noqa: E731
+    monkeypatch.setattr(raycast, "ProcessPoolExecutor", pool)
     monkeypatch.setattr(raycast, "cores", lambda: 3)
     monkeypatch.setattr(raycast, "SAMPLES_A_PROCESS", 4 * 144)
-    monkeypatch.setattr(raycast, "render", lambda *_: 1)
-    monkeypatch.setattr(
-        raycast, "_rendered_by_processes", lambda views, samples, shadow_rays, workers: [workers]
-    )
-    assert list(render_all([(world, 0.0, CAMERAS[0])], samples)) == [expected]
+    monkeypatch.setattr(raycast, "render", lambda *view: view[3])
+    assert list(render_all([(world, 0.0, CAMERAS[0])], samples)) == [samples]
+    assert begun == expected

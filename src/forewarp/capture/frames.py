@@ -17,8 +17,8 @@ import numpy as np
 import torch
 from torch.nn.functional import adaptive_max_pool2d, interpolate
 
-from forewarp.data.files import UNREAD
-from forewarp.data.images import SUFFIXES, bright, common_header, in_order, read_image, write_image
+from forewarp.data.files import UNREAD, mismatch
+from forewarp.data.images import SUFFIXES, bright, by, common_header, in_order, read_image, write_image
 from forewarp.data.transforms import times_of
 from forewarp.data.video import HDR, Log, decode, deinterlacing, extracted, hdr_of, hdr_unsaid
 from forewarp.drawing.images import at_most
@@ -42,6 +42,10 @@ _WHOLE = 0.9  # share of its duration after which a video counts as whole
 NO_MASKS = (
     "expected masks in which what moves is bright, but got none above 127 of 255; write it as 255, or leave "
     "out masks="
+)
+_UNSAID = (
+    "10 bits or more of BT.2020 without a transfer are taken for SDR; if colours look faded, tag it as HLG "
+    "(ffmpeg -i IN -c copy -color_trc arib-std-b67 OUT.mp4) or PQ (smpte2084)"
 )
 _DAMAGE = re.compile("partial file|ended prematurely|corrupt")
 
@@ -132,7 +136,8 @@ def take(
             done["why"] = done["why"] or why
         else:
             done = _from_folder(folder, source, size, step)
-        if source.masks is not None and not write_masks(dark, source.masks, done):
+        of_images = (done[key] for key in ("sizes", "rows", "found", "originals"))
+        if source.masks is not None and not write_masks(dark, source.masks, *of_images):
             raise ValueError(f"{source.masks}: {NO_MASKS}")
         write_json(work / TAKEN, done)
     sizes = {name: tuple(size) for name, size in done["sizes"].items()}
@@ -147,36 +152,28 @@ def _from_video(
     with step("looking at frames") as progress:
         stamps, sharpnesses, widths, speeds, are_new, brightest = measure(video, progress, threads)
     if len(stamps) < _MIN_IMAGES:
-        got = f"{len(stamps)} frames"
-        raise ValueError(f"{video}: expected a video of many frames, but got {got}; film longer")
+        raise mismatch(video, "a video of many frames", f"{len(stamps)} frames", "film longer")
     kept = np.flatnonzero(are_new) if are_new.sum() >= _MIN_IMAGES else np.arange(len(stamps))
     count, why = frames_for(speeds[kept]) if count is None else (count, None)
     if why and len(kept) < len(stamps):
         why += f"; {len(stamps) - len(kept)} repeat the one before"
     chosen, times = kept[sharpest(stamps[kept], sharpnesses[kept], count)].tolist(), {}
-    bars = bars_of(brightest)
-    assumed = _told(bars, "are cut off")
-    if source.masks is not None:
-        assumed, bars = _told(bars, "stay, as masks= are of whole frames"), (0.0, 0.0)
-    if hdr_unsaid(video):
-        told = "10 bits or more of BT.2020 without a transfer are taken for SDR; if colours look faded, tag "
-        told += "it as HLG (ffmpeg -i IN -c copy -color_trc arib-std-b67 OUT.mp4) or PQ (smpte2084)"
-        assumed = f"{assumed}; {told}" if assumed else told
-    transfer = hdr_of(video)
+    bars, stay = bars_of(brightest), source.masks is not None
+    assumed = [_told(bars, "stay, as masks= are of whole frames" if stay else "are cut off")]
+    assumed += [_UNSAID if hdr_unsaid(video) else None]
+    transfer, bars = hdr_of(video), (0.0, 0.0) if stay else bars
     changed = [f"{HDR[transfer]}, tone-mapped to SDR"] if transfer else []
     changed += ["interlaced, made whole"] if deinterlacing(video) else []
-    title = "taking frames" + (f" ({'; '.join(changed)})" if changed else "")
-    with step(title) as progress:
+    with step("taking frames" + (f" ({'; '.join(changed)})" if changed else "")) as progress:
         for index, pixels in zip(chosen, extracted(video, chosen, size, threads, bars)):
             name = f"frame_{index + 1:06d}.jpg"
             write_image(folder / name, pixels)
             times[name] = float(stamps[index])
             progress(len(times), len(chosen))
     if len(times) < len(chosen):
-        raise ValueError(f"{video}: expected {len(chosen)} frames, but got {len(times)}; convert the video")
-    height, width = pixels.shape[:2]
-    record = _record(times, chosen, len(stamps), widths[chosen], dict.fromkeys(times, (width, height)), {})
-    return record | {"why": why, "assumed": assumed}
+        raise mismatch(video, f"{len(chosen)} frames", len(times), "convert the video")
+    sizes, told = dict.fromkeys(times, pixels.shape[1::-1]), "; ".join(filter(None, assumed)) or None
+    return _record(times, chosen, len(stamps), widths[chosen], sizes, {}, why=why, assumed=told)
 
 
 def bars_of(brightest: np.ndarray) -> tuple[float, float]:
@@ -230,6 +227,8 @@ def frames_for(speeds: np.ndarray) -> tuple[int, str]:
     (150, 'what is fast moves by 2 pixels of 640 a frame')
     >>> frames_for(np.full(600, 0.5))
     (120, 'what is fast moves by 0.5 pixels of 640 a frame; 120 at least')
+    >>> frames_for(np.full(600, 30.0))
+    (300, 'what is fast moves by 30 pixels of 640 a frame; 300 at most')
     """
     found = len(speeds)
     if found <= SHORT:
@@ -253,7 +252,7 @@ def _from_folder(folder: Path, source: Source, size: int | None, step: Step) -> 
     paths = images_in(source.images, as_stored)
     if len(paths) < _MIN_IMAGES:
         got = f"{len(paths)} PNG or JPEG files" if paths else "none"
-        raise ValueError(f"{source.images}: expected a folder of many pictures, PNG or JPEG, but got {got}")
+        raise mismatch(source.images, "a folder of many pictures, PNG or JPEG", got)
     rows = {path: row for row, path in enumerate(paths)}
     numbers, assumed = rows, None
     if as_stored:
@@ -267,40 +266,34 @@ def _from_folder(folder: Path, source: Source, size: int | None, step: Step) -> 
     with step("reading pictures") as progress:
         for done, path in enumerate(paths, 1):
             pixels = read_image(path, upright=not as_stored).numpy()
-            first = pixels.shape if first is None else first
-            if pixels.shape != first and not as_stored:
-                raise ValueError(
-                    f"{path}: expected {first[1]} x {first[0]} pixels as the first, but got "
-                    f"{pixels.shape[1]} x {pixels.shape[0]}, as its EXIF orientation says; leave it out"
-                )
+            first = first or by(pixels.shape[1::-1])
+            if (got := by(pixels.shape[1::-1])) != first and not as_stored:
+                told = f"{got}, as its EXIF orientation says"
+                raise mismatch(path, f"{first} pixels as the first", told, "leave it out")
             if not has_alpha and (pixels[..., 3] < 255).any():
-                raise ValueError(
-                    f"{path}: expected alpha in all pictures or in none, but got one of few that have it; "
-                    "remove it"
-                )
+                few = "one of few that have it"
+                raise mismatch(path, "alpha in all pictures or in none", few, "remove it")
             pixels = pixels if has_alpha else pixels[..., :3]
-            longer = max(pixels.shape[:2])
-            if size is not None and size < longer and not as_stored:
-                pixels = shrunk(pixels, *(max(1, round(n * size / longer)) for n in pixels.shape[:2]))
+            pixels = pixels if as_stored else within(pixels, size)
             is_png = has_alpha or path.suffix.lower() == ".png"
             name = f"picture_{done:06d}{'.png' if is_png else '.jpg'}"
             write_image(folder / name, pixels)
             originals[name] = path.relative_to(source.images).as_posix()
-            sizes[name], times[name] = (pixels.shape[1], pixels.shape[0]), float(numbers[path])
+            sizes[name], times[name] = pixels.shape[1::-1], float(numbers[path])
             widths.append(edge_width(pixels[..., :3].mean(-1)))
             if not as_stored:
                 brightest = np.maximum(brightest, pixels[..., :3].max(-1))
             progress(done, len(paths))
-    record = _record(times, [rows[path] for path in paths], len(paths), widths, sizes, originals)
-    bars = (0.0, 0.0) if as_stored else bars_of(brightest)
-    return record | {"assumed": assumed or _told(bars, "stay: crop the pictures")}
+    if not as_stored:
+        assumed = _told(bars_of(brightest), "stay: crop the pictures")
+    in_turn = [rows[path] for path in paths]
+    return _record(times, in_turn, len(paths), widths, sizes, originals, assumed=assumed)
 
 
-def _record(times: dict, rows: Sequence[int], found: int, widths, sizes: dict, originals: dict) -> dict:
-    """Return the numbers of ``Frames``, as JSON has them: it knows no infinity."""
+def _record(times: dict, rows: list[int], found: int, widths, sizes: dict, originals: dict, **told) -> dict:
+    """Return what ``Frames`` has, as JSON can hold it: it knows no infinity."""
     edges = min(float(np.median(widths)), 1e6)
-    numbers = {"times": times, "rows": list(rows), "found": found, "edges": edges, "sizes": sizes}
-    return numbers | {"originals": originals}
+    return dict(times=times, rows=rows, found=found, edges=edges, sizes=sizes, originals=originals, **told)
 
 
 def images_in(folder: Path, deep: bool = False) -> list[Path]:
@@ -315,11 +308,9 @@ def images_in(folder: Path, deep: bool = False) -> list[Path]:
     images = [p for p in files if p.suffix.lower() in SUFFIXES]
     others = sorted(p for p in files if p.suffix.lower() in UNREAD)
     if others and not (deep and images):
-        kind = others[0].suffix[1:].upper()
-        advice = ", or set the phone's camera to its most compatible format" if kind[:3] == "HEI" else ""
-        raise ValueError(
-            f"{others[0]}: expected PNG or JPEG, but got {kind}; convert the pictures to JPEG{advice}"
-        )
+        kind, advice = others[0].suffix[1:].upper(), "convert the pictures to JPEG"
+        advice += ", or set the phone's camera to its most compatible format" if kind[:3] == "HEI" else ""
+        raise mismatch(others[0], "PNG or JPEG", kind, advice)
     return in_order(images)
 
 
@@ -345,31 +336,62 @@ def shrunk(pixels: np.ndarray, height: int, width: int) -> np.ndarray:
     return small[0].permute(1, 2, 0).round().clamp(0, 255).byte().numpy()
 
 
-def write_masks(folder: Path, masks: Path, done: dict) -> bool:
+def within(pixels: np.ndarray, size: int | None) -> np.ndarray:
+    """Make an image (H, W, C) at most ``size`` pixels wide or high; None: leave it."""
+    longer = max(pixels.shape[:2])
+    if size is None or longer <= size:
+        return pixels
+    return shrunk(pixels, *(max(1, round(n * size / longer)) for n in pixels.shape[:2]))
+
+
+def write_smaller(folder: Path, name: str, pixels: np.ndarray, scale: int) -> None:
+    """Write an image ``scale`` times smaller into ``images_<scale>``: the mean of each block of pixels, less
+    what is left at the ends.
+    """
+    height, width = (n // scale for n in pixels.shape[:2])
+    small = shrunk(pixels[: height * scale, : width * scale], height, width)
+    write_image(folder / f"images_{scale}" / name, small)
+
+
+def write_masks(
+    folder: Path, masks: Path, sizes: Mapping, rows: Sequence[int], found: int, originals: Mapping
+) -> bool:
     """Write a mask for each image, in which black is what moves and white is matched; tell whether any does.
 
     There are as many as frames in the video, or images in the folder, in order; else a mask has the name of
     its image. A folder's images have names of the user's: there the name comes first.
+
+    Args:
+        folder: to write to.
+        masks: folder of the user's.
+        sizes, rows, found, originals: as of ``Frames``.
     """
-    paths, originals, names = images_in(masks, deep=True), done["originals"], list(done["times"])
+    paths = images_in(masks, deep=True)
     by_name = {path.relative_to(masks).with_suffix("").as_posix(): path for path in paths}
-    stems = [Path(originals.get(name, name)).with_suffix("").as_posix() for name in names]
-    are_named, are_counted = all(stem in by_name for stem in stems), len(paths) == done["found"]
+    stems = [Path(originals.get(name, name)).with_suffix("").as_posix() for name in sizes]
+    are_named, are_counted = all(stem in by_name for stem in stems), len(paths) == found
     if not are_named and not are_counted:
-        raise ValueError(
-            f"{masks}: expected {done['found']} masks, one for each frame or picture, or masks with the "
-            f"names of the pictures ({stems[0]}.png), but got {len(paths)}"
-        )
+        expected = f"{found} masks, one for each frame or picture, or masks with the names of the pictures"
+        raise mismatch(masks, f"{expected} ({stems[0]}.png)", len(paths))
     in_turn = are_counted and not (are_named and originals)  # frames may be counted from 0 or from 1
-    chosen = [paths[row] for row in done["rows"]] if in_turn else [by_name[stem] for stem in stems]
+    chosen = [paths[row] for row in rows] if in_turn else [by_name[stem] for stem in stems]
     any_moves = False
-    for name, path in zip(names, chosen):
-        width, height = done["sizes"][name]
+    for (name, size), path in zip(sizes.items(), chosen):
         # A pixel is kept out as soon as a part of it moves.
-        moving = adaptive_max_pool2d(bright(path).float()[None, None], (height, width))[0, 0] > 0
+        moving = adaptive_max_pool2d(bright(path).float()[None, None], size[::-1])[0, 0] > 0
         any_moves |= bool(moving.any())
-        write_image(folder / f"{name}.png", (255 * ~moving).byte().numpy())
+        write_mask(folder / f"{name}.png", moving.numpy())
     return any_moves
+
+
+def write_mask(path: Path, is_dark: np.ndarray) -> None:
+    """Write a mask (H, W) that is black where ``is_dark``, as where something moves, and else white."""
+    write_image(path, np.where(is_dark, 0, 255).astype(np.uint8))
+
+
+def read_mask(path: Path) -> np.ndarray:
+    """Read where a mask is black: bool (H, W)."""
+    return read_image(path)[..., 0].numpy() == 0
 
 
 def sharpness(grey: np.ndarray) -> float:
@@ -477,24 +499,21 @@ def measure(video: Path, progress: Progress, threads: int | None = None) -> tupl
 
     **Cost** one decoding, and about 13 ms a frame.
     """
-    sharp, widths, speeds, are_new, before, log = [], [], [], [], None, Log()
-    brightest = 0
+    rows, before, brightest, log = [], None, 0, Log()
     long, short = (f"if(gt({a},{b}),{_MEASURED},-1)" for a, b in (("iw", "ih"), ("ih", "iw")))
     small = f"{deinterlacing(video)}scale=w='min(iw,{long})':h='min(ih,{short})',format=gray"
     for image in decode(video, f"showinfo=checksum=0,{small}", "pgm", log, threads):
-        sharp.append(sharpness(image))
-        widths.append(edge_width(image))
-        speeds.append(0.0 if before is None else speed(before, image))
-        are_new.append(before is None or np.abs(image - before.astype(np.float32)).mean() >= _SAME)
+        moved = 0.0 if before is None else speed(before, image)
+        is_new = before is None or np.abs(image - before.astype(np.float32)).mean() >= _SAME
+        rows.append((sharpness(image), edge_width(image), moved, is_new))
         before, brightest = image, np.maximum(brightest, image)
-        if len(sharp) % 10 == 1 and log.duration and log.stamps:
+        if len(rows) % 10 == 1 and log.duration and log.stamps:
             seconds = min(log.stamps[-1] - log.stamps[0], log.duration)
             progress(round(10 * seconds), math.ceil(10 * log.duration))
-    _refuse(video, log, len(sharp))
-    progress(len(sharp), len(sharp))
-    stamps = np.array(log.stamps[: len(sharp)])
-    stamps -= stamps[0]
-    return stamps, *map(np.array, (sharp, widths, speeds, are_new)), brightest
+    _refuse(video, log, len(rows))
+    progress(len(rows), len(rows))
+    stamps = np.array(log.stamps[: len(rows)])
+    return stamps - stamps[0], *map(np.array, zip(*rows)), brightest
 
 
 def _refuse(video: Path, log: Log, count: int) -> None:
@@ -506,19 +525,17 @@ def _refuse(video: Path, log: Log, count: int) -> None:
             if "moov atom not found" in text and stream.read(8).endswith(b"ftyp"):
                 got = "one that was cut off; copy it again"
         got = "sound alone; choose a video" if "matches no streams" in text else got
-        raise ValueError(f"{video}: expected a video, but got {got}")
+        raise mismatch(video, "a video", got)
     if count == 1:
-        raise ValueError(f"{video}: expected a video of many frames, but got one frame")
+        raise mismatch(video, "a video of many frames", "one frame")
     if len(stamps) < count or not np.all(np.diff(stamps[:count]) > 0):
-        raise ValueError(
-            f"{video}: expected a time stamp for each frame, each later than the one before, but got "
-            f"{len(stamps)} for {count} frames; save it anew with a video editor"
-        )
+        expected = "a time stamp for each frame, each later than the one before"
+        got = f"{len(stamps)} for {count} frames"
+        raise mismatch(video, expected, got, "save it anew with a video editor")
     seconds = (stamps[count - 1] - stamps[0]) * count / (count - 1)
     # The header's duration is of all streams: sound that goes on is no damage.
     is_damaged = _DAMAGE.search(text) or ": Audio:" not in text
     if is_damaged and seconds < _WHOLE * log.duration:
-        raise ValueError(
-            f"{video}: expected {log.duration:.1f} seconds, as its header says, but got {seconds:.1f}; copy "
-            "it again, or save the part that plays with a video editor"
-        )
+        advice = "copy it again, or save the part that plays with a video editor"
+        expected = f"{log.duration:.1f} seconds, as its header says"
+        raise mismatch(video, expected, f"{seconds:.1f}", advice)

@@ -30,6 +30,9 @@ _LOOKS = 40  # images of a whole film in which a way is looked at
 # Of 255: least change of what moves before a fixed camera, and how many deviations of a pixel's noise it is.
 _CHANGE, _NOISE = 14.0, 5.0
 _SPECK, _GAP = 3, 5  # of the grid: smaller spots, and smaller holes, are noise
+_OWN_SIDE = 320  # pixels of the longer side in which a camera's own motion is looked for
+# Gradient of texture; pixels of 640; share that rests if a camera is fixed.
+_EDGES, _RESTS, _AT_REST = 20.0, 1.0, 0.5
 
 
 def moving_masks(paths: Sequence[Path], cameras: Sequence[Camera]) -> Iterator[np.ndarray | None]:
@@ -48,8 +51,7 @@ def moving_masks(paths: Sequence[Path], cameras: Sequence[Camera]) -> Iterator[n
     """
     film = _Film(paths, cameras)
     for i in range(len(paths)):
-        tracks = film.tracks(i, range(i - _REACH, i + _REACH + 1))
-        yield film.where(_OFF, tracks)
+        yield film.where(_OFF, film.tracks(i, range(i - _REACH, i + _REACH + 1)))
 
 
 def resting_masks(
@@ -62,9 +64,8 @@ def resting_masks(
     """
     film, every, masks = _Film(paths, cameras), max(1, len(paths) // _LOOKS), []
     for i in which:
-        tracks = film.tracks(i, range(len(paths)))
-        looked = {j: tracks[j] for j in tracks if abs(j - i) <= _REACH or (j - i) % every == 0}
-        moves = film.where(_CREPT, looked)
+        tracks = film.tracks(i, range(len(paths))).items()
+        moves = film.where(_CREPT, {j: t for j, t in tracks if abs(j - i) <= _REACH or (j - i) % every == 0})
         masks.append(None if moves is None else ~moves)
     return masks
 
@@ -82,8 +83,7 @@ class _Film:
         self.flow = lru_cache(maxsize=4 * _REACH + 4)(self._flow)
 
     def _grey(self, i: int) -> np.ndarray:
-        image = read_image(self.paths[i]).numpy()[..., :3]
-        return cv2.cvtColor(cv2.resize(image, self.size, interpolation=cv2.INTER_AREA), cv2.COLOR_RGB2GRAY)
+        return _small_grey(read_image(self.paths[i]).numpy()[..., :3], self.size)
 
     def _flow(self, i: int, j: int) -> np.ndarray:
         return self.search.calc(self.grey(i), self.grey(j), None)
@@ -140,6 +140,28 @@ class Still:
         return _whole(changed, np.ones(changed.shape, bool))
 
 
+def is_fixed(images: Sequence[np.ndarray]) -> bool:
+    """Tell whether a camera stands: what has texture rests between most of its images (H, W, 3) uint8.
+
+    Movers may fill some of the image, the median over the textured pixels does not heed them.
+    """
+    scale = _OWN_SIDE / max(images[0].shape[:2])
+    size = [max(_LEAST_SIDE, round(scale * length)) for length in images[0].shape[1::-1]]
+    first, *others = (_small_grey(image, size) for image in images)
+    textured = np.hypot(*(cv2.Sobel(first, cv2.CV_32F, *axis) for axis in ((1, 0), (0, 1)))) > _EDGES
+    looked_at, rests = textured if textured.mean() > 0.01 else ..., []
+    search = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+    for other in others:
+        lengths = np.hypot(*search.calc(first, other, None).transpose(2, 0, 1))[looked_at]
+        rests.append(float((lengths * 640 / _OWN_SIDE < _RESTS).mean()))
+    return float(np.median(rests)) > _AT_REST
+
+
+def _small_grey(image: np.ndarray, size: Sequence[int]) -> np.ndarray:
+    """Make a small grey image (h, w) of (H, W, 3) uint8; ``size`` is (w, h)."""
+    return cv2.cvtColor(cv2.resize(image, size, interpolation=cv2.INTER_AREA), cv2.COLOR_RGB2GRAY)
+
+
 def _reduced(image: np.ndarray) -> np.ndarray:
     """Make an image (H, W, 3) at most 480 wide or high, float32."""
     scale = min(1.0, _SIDE / max(image.shape[:2]))
@@ -153,9 +175,7 @@ def _changes(image: np.ndarray, still: np.ndarray) -> np.ndarray:
     return np.abs(change - np.median(change, axis=(0, 1))).max(-1)
 
 
-def _followed(
-    track: tuple, forward: np.ndarray, backward: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _followed(track: tuple, forward: np.ndarray, backward: np.ndarray) -> tuple:
     """Follow pixels (h, w) to the next image: x, y, and whether they are still in sight: back leads where
     they came from.
     """
@@ -179,15 +199,15 @@ def _errors(tracks: dict, cameras: Sequence[Camera]) -> tuple[np.ndarray, np.nda
     Of nearly parallel rays the nearest point may lie anywhere, also behind the camera.
     """
     shape = next(iter(tracks.values()))[0].shape
-    pixels, normal, moment = {}, torch.zeros(*shape, 3, 3).double(), torch.zeros(*shape, 3).double()
-    mean_ray = torch.zeros(*shape, 3).double()
+    pixels, normal, eye = {}, torch.zeros(*shape, 3, 3).double(), torch.eye(3).double()
+    moment = mean_ray = torch.zeros(*shape, 3).double()
     for i, (x, y, seen) in tracks.items():
         pixels[i] = torch.from_numpy(np.stack([x, y], -1)) + 0.5, torch.from_numpy(seen)
         ray = cameras[i].directions(*pixels[i][0].unbind(-1)) * pixels[i][1][..., None]
-        across = torch.eye(3).double() * pixels[i][1][..., None, None] - ray[..., :, None] * ray[..., None, :]
+        across = eye * pixels[i][1][..., None, None] - ray[..., :, None] * ray[..., None, :]
         normal, moment = normal + across, moment + across @ cameras[i].center.double()
         mean_ray = mean_ray + ray
-    nearest = torch.linalg.solve(normal + 1e-9 * torch.eye(3).double(), moment)
+    nearest = torch.linalg.solve(normal + 1e-9 * eye, moment)
     far = _FAR * torch.nn.functional.normalize(mean_ray, dim=-1)
     errors, count = torch.zeros(2, *shape).double(), sum(seen.int() for _, seen in pixels.values())
     for i, (pixel, seen) in pixels.items():
@@ -195,6 +215,11 @@ def _errors(tracks: dict, cameras: Sequence[Camera]) -> tuple[np.ndarray, np.nda
         error = torch.where(depth > 0, (shown - pixel).norm(dim=-1), torch.inf)
         errors = torch.where(seen, torch.maximum(errors, error), errors)
     return errors.amin(0).numpy(), (count >= _LEAST).numpy()
+
+
+def resized_mask(mask: np.ndarray, size: Sequence[int]) -> np.ndarray:
+    """Give a mask (h, w) bool another ``size``, (width, height), by its nearest pixels."""
+    return cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
 
 
 def _whole(moves: np.ndarray, known: np.ndarray) -> np.ndarray:

@@ -6,20 +6,19 @@ import dataclasses
 import hashlib
 import json
 import shutil
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, contextmanager, suppress
 from pathlib import Path
 
 import cv2
-import numpy as np
 import pycolmap
 import torch
 from filelock import FileLock, Timeout
 
 from forewarp.capture import poses, scene
-from forewarp.capture.frames import TAKEN, Frames, Source, Step, is_hidden, take
+from forewarp.capture.frames import TAKEN, Frames, Source, Step, is_hidden, read_mask, take, write_mask
 from forewarp.capture.poses import Reconstruction, Search, refuse_matches, refuse_poses
-from forewarp.data.images import read_image, write_image
+from forewarp.data.files import mismatch
 from forewarp.drawing.images import write_png
 from forewarp.files import folder_written_whole, read_json, write_json
 
@@ -57,13 +56,8 @@ def capture(
     Raises:
         ValueError: where nothing good comes of it, with advice; frames, features and matches stay.
     """
-    about = {**dataclasses.asdict(source), **dataclasses.asdict(search), "frames": frames, "size": size}
-    del about["threads"]
-    cv2.setNumThreads(search.threads or -1)
-    if search.threads is not None:
-        torch.set_num_threads(search.threads)
-    about["files"] = [fingerprint(path) for path in (source.path, source.masks) if path is not None]
-    with work_folder(out, about) as work:
+    about = {**dataclasses.asdict(source), "frames": frames, "size": size}
+    with work_for(out, search, (source.path, source.masks), **about) as work:
         images = take(work, source, step, count=frames, size=size, threads=search.threads)
         if source.colmap is not None:
             found = poses.read_model(source.colmap, images.originals)
@@ -79,14 +73,13 @@ def capture(
                 for left in work.iterdir():
                     if left.name != _STATE:
                         shutil.rmtree(left) if left.is_dir() else left.unlink()
-                options = {"size": size, "threads": search.threads, "why": _AGAIN}
-                images = take(work, source, step, count=more, **options)
+                images = take(work, source, step, count=more, size=size, threads=search.threads, why=_AGAIN)
                 found = find_poses(work, images, search, step, force)
         refuse_poses(found, images, force=force)
         found = scene.placed(found)
         limits = scene.limits_of(found)
         with step("what moves, writing") as progress, folder_written_whole(out, ABOUT) as folder:
-            burnt = _burnt_in(work)
+            burnt = read_mask(work / _BURNT) if (work / _BURNT).exists() else None
             written = scene.write(folder, source.video is not None, images, found, limits, progress, burnt)
             if limits is not None:
                 write_png(folder / PICTURE, scene.draw(found, limits))
@@ -106,16 +99,15 @@ def find_poses(work: Path, images: Frames, search: Search, step: Step, force: bo
             poses.match(database, search, progress, every)
         if every is not None:  # before the work that a refusal would waste
             refuse_matches(database, images, force)
-    if (burnt := _burnt_in(work)) is None and (burnt := poses.burnt_in(database)).any():
-        write_image(work / _BURNT, np.where(burnt, 0, 255).astype(np.uint8))
-    if burnt.any():
+    if not (work / _BURNT).exists() and (burnt := poses.burnt_in(database)).any():
+        write_mask(work / _BURNT, burnt)
+    if (work / _BURNT).exists():
         with step("matches without what is burnt in") as progress:
-            poses.leave_out(database, burnt)
+            poses.leave_out(database, read_mask(work / _BURNT))
             poses.match(database, search, progress)
     refuse_matches(database, images, force)
     with step("poses") as progress:
-        shutil.rmtree(work / "models", ignore_errors=True)
-        model = poses.reconstruct(database, images.folder, work / "models", search, progress)
+        model = poses.reconstruct(database, images.folder, search, progress)
     if model is None:
         refuse_poses(None, images, database)
     with step("adjustment") as progress:
@@ -150,18 +142,27 @@ def record(folder: Path, facts: dict) -> None:
     write_json(folder / ABOUT, facts)
 
 
-def _burnt_in(work: Path) -> np.ndarray | None:
-    """Read where an earlier call or step found something burnt in, (H, W) bool; None: nowhere."""
-    path = work / _BURNT
-    return read_image(path)[..., 0].numpy() == 0 if path.exists() else None
-
-
 def fingerprint(path: Path) -> str:
     """A digest of the name, bytes and time of change of a file, or of each file of a folder."""
     files = [path] if path.is_file() else sorted(file for file in path.rglob("*") if file.is_file())
     files = [file for file in files if not is_hidden(file.relative_to(path))]
     states = [(str(file), file.stat().st_size, file.stat().st_mtime_ns) for file in files]
     return hashlib.sha256(repr(states).encode()).hexdigest()
+
+
+def work_for(out: Path, search: Search, inputs: Sequence[Path | None], **about) -> AbstractContextManager:
+    """Give the ``work_folder`` of a capture to ``out``, and have it run on as many threads as ``search`` has.
+
+    Args:
+        inputs: files and folders that are read.
+        about: what else the work depends on, beside ``search``.
+    """
+    cv2.setNumThreads(search.threads or -1)
+    if search.threads is not None:
+        torch.set_num_threads(search.threads)
+    about |= dataclasses.asdict(search)
+    del about["threads"]
+    return work_folder(out, about | {"files": [fingerprint(path) for path in inputs if path is not None]})
 
 
 @contextmanager
@@ -185,9 +186,7 @@ def work_folder(out: Path, about: Mapping[str, object]) -> Iterator[Path]:
     try:
         lock.acquire(timeout=0)
     except Timeout:
-        raise ValueError(
-            f"{out}: expected one capture at a time, but got another at work; wait for it"
-        ) from None
+        raise mismatch(out, "one capture at a time", "another at work", "wait for it") from None
     stays = False
     try:
         work.mkdir(exist_ok=True)
@@ -203,9 +202,8 @@ def work_folder(out: Path, about: Mapping[str, object]) -> Iterator[Path]:
         taken = (work / TAKEN).exists()
         stays = taken or not (is_refusal or isinstance(error, ImportError))
         if is_refusal and taken:
-            raise ValueError(
-                f"{error}; what was found stays in {work}, from which the same command goes on"
-            ) from error
+            stay = f"what was found stays in {work}, from which the same command goes on"
+            raise ValueError(f"{error}; {stay}") from error
         raise
     finally:
         if not stays:  # under the lock: what another call begins afterwards is its own

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+import shutil
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -14,7 +15,8 @@ import torch
 from forewarp.capture.frames import Frames, Progress
 from forewarp.data.cameras import check_lens
 from forewarp.data.directions import inverted, opposite, other_readings
-from forewarp.data.files import SceneError
+from forewarp.data.files import SceneError, mismatch
+from forewarp.data.images import by
 from forewarp.scene.camera import Camera, Lens
 
 pycolmap.logging.minloglevel = pycolmap.logging.FATAL.value  # print nothing but what ends it
@@ -135,10 +137,8 @@ def _camera(image: pycolmap.Image) -> Camera:
     values = dict(zip(names, map(float, camera.params)))
     beyond = any(value != 0 for name, value in values.items() if name not in _PARAMETERS)
     if beyond or camera.model_name not in _MODELS:
-        raise ValueError(
-            f"{image.name}: expected a camera model with k1 k2 k3 p1 p2, as OPENCV, but got "
-            f"{camera.model_name}; undistort the pictures (colmap image_undistorter)"
-        )
+        advice = "undistort the pictures (colmap image_undistorter)"
+        raise mismatch(image.name, "a camera model with k1 k2 k3 p1 p2, as OPENCV", camera.model_name, advice)
     fx, fy = (values.get(name, values.get("f", 0.0)) for name in ("fx", "fy"))
     k = values.get("k1", values.get("k", 0.0)), values.get("k2", 0.0), values.get("k3", 0.0)
     p = values.get("p1", 0.0), values.get("p2", 0.0)
@@ -157,37 +157,29 @@ def read_model(folder: Path, originals: Mapping[str, str] | None = None) -> Reco
     Raises:
         ValueError: where there is none, or one that cannot be read, or that has other images.
     """
-    names = "cameras", "images", "points3D"
-    models = [
-        folder / place
-        for place in _PLACES
-        for kind in ("bin", "txt")
-        if all((folder / place / f"{n}.{kind}").is_file() for n in names)
-    ]
-    if not models:
-        raise ValueError(
-            f"colmap: expected a folder with cameras.bin, images.bin and points3D.bin (or .txt), but got "
-            f"{folder}; it is often called sparse/0"
-        )
-    folder = models[0]
+    parts = [[f"{name}.{kind}" for name in ("cameras", "images", "points3D")] for kind in ("bin", "txt")]
+    places = (folder / place for place in _PLACES)
+    there = [place for place in places if any(all((place / file).is_file() for file in of) for of in parts)]
+    if not there:
+        expected = "a folder with cameras.bin, images.bin and points3D.bin (or .txt)"
+        raise mismatch("colmap", expected, folder, "it is often called sparse/0")
+    folder = there[0]
     try:
         model = pycolmap.Reconstruction(folder)
     except (RuntimeError, ValueError, IndexError, OverflowError, MemoryError) as error:
         text = (str(error).strip().splitlines() or ["a file that cannot be read"])[-1]
-        raise ValueError(f"{folder}: expected a COLMAP model, but got {text}; export it again") from error
-    if originals is not None:
-        ours = {original: name for name, original in originals.items()}
-        absent = sorted({image.name for image in model.images.values() if image.has_pose} - ours.keys())
-        if len(absent) == sum(image.has_pose for image in model.images.values()):
-            got = min(ours, default="none")
-            raise ValueError(
-                f"images: expected pictures as {absent[0]}, as the model has, but got {got}; set images= to "
-                "the folder where its names begin, or rename them"
-            )
-        for image in model.images.values():
-            image.name = ours.get(image.name, image.name)
-    else:
-        absent = []
+        raise mismatch(folder, "a COLMAP model", text, "export it again") from error
+    if originals is None:
+        return Reconstruction.of(model)
+    ours = {original: name for name, original in originals.items()}
+    posed = {image.name for image in model.images.values() if image.has_pose}
+    absent = sorted(posed - ours.keys())
+    if len(absent) == len(posed):
+        advice = "set images= to the folder where its names begin, or rename them"
+        got = min(ours, default="none")
+        raise mismatch("images", f"pictures as {absent[0]}, as the model has", got, advice)
+    for image in model.images.values():
+        image.name = ours.get(image.name, image.name)
     return replace(Reconstruction.of(model, absent), absent=absent)
 
 
@@ -236,9 +228,8 @@ def find_features(
     reader = pycolmap.ImageReaderOptions(camera_model=search.lens)
     if masks is not None:
         reader.mask_path = masks
-    options = pycolmap.FeatureExtractionOptions(
-        use_gpu=False, max_image_size=_FEATURE_SIDE, num_threads=search.threads or -1
-    )
+    options = pycolmap.FeatureExtractionOptions(use_gpu=False, num_threads=search.threads or -1)
+    options.max_image_size = _FEATURE_SIDE
     options.sift.max_num_features = search.features
     with pycolmap.Database.open(database) as base:
         numbers = {image.name: image.image_id for image in base.read_all_images()}
@@ -247,19 +238,18 @@ def find_features(
         pycolmap.import_images(database, images, camera_mode=mode, image_names=new, options=reader)
     chosen = names[::every]
     left = [name for name in chosen if name not in done]
-    progress(len(chosen) - len(left), len(chosen))
-    for start in range(0, len(left), _BATCH):
-        pycolmap.extract_features(
-            database,
-            images,
-            image_names=left[start : start + _BATCH],
-            camera_mode=mode,
-            reader_options=reader,
-            extraction_options=options,
-            device=pycolmap.Device.cpu,
-        )
-        progress(len(chosen) - max(0, len(left) - start - _BATCH), len(chosen))
+    how = {"camera_mode": mode, "reader_options": reader, "extraction_options": options}
+    for some in _batches(left, _BATCH, len(chosen), progress):
+        pycolmap.extract_features(database, images, some, **how, device=pycolmap.Device.cpu)
     return database
+
+
+def _batches(left: Sequence, size: int, total: int, progress: Progress) -> Iterator[Sequence]:
+    """Yield what is left of ``total`` in batches, and tell after each how much is done."""
+    progress(total - len(left), total)
+    for start in range(0, len(left), size):
+        yield left[start : start + size]
+        progress(total - max(0, len(left) - start - size), total)
 
 
 def first_look(count: int) -> int:
@@ -287,30 +277,16 @@ def match(
         if named is None:
             names, rows = sorted(images), pairs_of(len(images), search.matching)
             if every is not None:  # 1, 2, 4 ... of those further
-                rows = [
-                    (i, j) for i, j in rows if i % every == j % every == 0 and ((j - i) & (j - i - 1)) == 0
-                ]
+                rows = [(i, j) for i, j in rows if i % every == j % every == 0 and not (j - i) & (j - i - 1)]
             pairs = [(names[i], names[j]) for i, j in rows]
-        left = [
-            f"{first} {second}\n"
-            for first, second in pairs
-            if not base.exists_two_view_geometry(images[first], images[second])
-        ]
+        left = [pair for pair in pairs if not base.exists_two_view_geometry(*map(images.get, pair))]
     options = pycolmap.FeatureMatchingOptions(use_gpu=False, num_threads=search.threads or -1)
-    verification = pycolmap.TwoViewGeometryOptions()
+    verification, listed = pycolmap.TwoViewGeometryOptions(), database.with_name("pairs.txt")
     verification.ransac.random_seed = search.seed
-    listed = database.with_name("pairs.txt")
-    progress(len(pairs) - len(left), len(pairs))
-    for start in range(0, len(left), _PAIR_BATCH):
-        listed.write_text("".join(left[start : start + _PAIR_BATCH]))
-        pycolmap.match_image_pairs(
-            database,
-            matching_options=options,
-            pairing_options=pycolmap.ImportedPairingOptions(match_list_path=listed),
-            verification_options=verification,
-            device=pycolmap.Device.cpu,
-        )
-        progress(len(pairs) - max(0, len(left) - start - _PAIR_BATCH), len(pairs))
+    pairing = pycolmap.ImportedPairingOptions(match_list_path=listed)
+    for some in _batches(left, _PAIR_BATCH, len(pairs), progress):
+        listed.write_text("".join(f"{first} {second}\n" for first, second in some))
+        pycolmap.match_image_pairs(database, options, pairing, verification, pycolmap.Device.cpu)
 
 
 def burnt_in(database: Path) -> np.ndarray:
@@ -328,10 +304,8 @@ def burnt_in(database: Path) -> np.ndarray:
         camera = base.read_all_cameras()[0]
         size = np.array([camera.width, camera.height])
         unit, cell = max(1.0, size.max() / 640), -(-size.max() // _CELLS)
-        places = {
-            image.image_id: base.read_keypoints(image.image_id)[:, :2].clip(0, size - 1)
-            for image in base.read_all_images()
-        }
+        numbers = [image.image_id for image in base.read_all_images()]
+        places = {number: base.read_keypoints(number)[:, :2].clip(0, size - 1) for number in numbers}
         pairs = [pycolmap.pair_id_to_image_pair(key) for key in base.read_two_view_geometry_num_inliers()[0]]
         count, still_pairs, still, seen = 0, *np.zeros((3, *-(-size // cell)))
         for pair in pairs[:: max(1, len(pairs) // _BURNT_PAIRS)]:
@@ -409,19 +383,13 @@ def pairs_of(count: int, matching: str) -> list[tuple[int, int]]:
 
 
 def reconstruct(
-    database: Path,
-    images: Path,
-    folder: Path,
-    search: Search,
-    progress: Progress,
-    names: Sequence[str] | None = None,
+    database: Path, images: Path, search: Search, progress: Progress, names: Sequence[str] | None = None
 ) -> pycolmap.Reconstruction | None:
     """Find cameras and points; return the model of the most images, or None.
 
     Args:
         database: of features and matches.
         images: folder of the images.
-        folder: for what is found.
         search: how to search.
         progress: called with images done and all.
         names: of a rig, the images to find, of which two are a model; None: all. Its cameras are few and far
@@ -429,7 +397,9 @@ def reconstruct(
     """
     with pycolmap.Database.open(database) as base:
         total = len(names or base.read_all_images())
-    done, best, tries = 1, None, _TRIES[: 1 if names is None else None]
+    least, tries = (MIN_MODEL, _TRIES[:1]) if names is None else (2, _TRIES)
+    done, best, folder = 1, None, database.with_name("models")
+    shutil.rmtree(folder, ignore_errors=True)
 
     def count() -> None:
         nonlocal done
@@ -437,20 +407,17 @@ def reconstruct(
         progress(min(done, total), total)
 
     for row, (angle, has_lens, seed) in enumerate(tries):
-        least = MIN_MODEL if names is None else 2
-        options = pycolmap.IncrementalPipelineOptions(
-            random_seed=search.seed + seed, num_threads=search.threads or -1, min_model_size=least
-        )
+        options, seed = pycolmap.IncrementalPipelineOptions(), search.seed + seed
+        options.num_threads, options.min_model_size = search.threads or -1, least
         options.image_names = list(names or ())
-        options.mapper.random_seed = options.triangulation.random_seed = search.seed + seed
+        options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = seed
         options.mapper.init_min_tri_angle = angle
         options.ba_refine_extra_params = options.mapper.abs_pose_refine_extra_params = has_lens
-        pycolmap.set_random_seed(search.seed + seed)
+        pycolmap.set_random_seed(seed)
         place, done = folder / str(row), 1
         place.mkdir(parents=True)
-        models = pycolmap.incremental_mapping(
-            database, images, place, options, initial_image_pair_callback=count, next_image_callback=count
-        )
+        told = {"initial_image_pair_callback": count, "next_image_callback": count}
+        models = pycolmap.incremental_mapping(database, images, place, options, **told)
         best = max((*filter(None, [best]), *models.values()), key=lambda m: m.num_reg_images(), default=None)
         if best is not None and best.num_reg_images() >= (_ALL if total > _FEW else 1.0) * total:
             break
@@ -471,11 +438,8 @@ def adjust(
     """
     progress(0, 1)
     error = float(model.compute_mean_reprojection_error())
-    doubtful = {
-        number
-        for number, point in model.points3D.items()
-        if point.track.length() < sure_views or point.error > _SURE_ERROR
-    }
+    points = model.points3D.items()
+    doubtful = {n for n, p in points if p.track.length() < sure_views or p.error > _SURE_ERROR}
     needed = set()
     for image in model.reg_image_ids():
         seen = {point.point3D_id for point in model.images[image].points2D if point.has_point3D()}
@@ -509,6 +473,7 @@ MIN_PARALLAX = 0.01  # the extent of the cameras' places as a share of the dista
 _PAIRS, _MIN_INLIERS = 60, 30  # of images that are looked at; matches of each
 _SHIFTS = 0.03, 0.4  # of pairs in which a rotation and a step can be told apart
 _FOCAL_LENGTHS = (0.6, 0.8, 1.0, 1.25, 1.6, 2.0)  # shares of the longer side that are tried
+_MOVES_AROUND = "one that moves around things near and far"
 _WALK = "it only turns, or moves before something flat: walk around the subject, not along a wall"
 
 
@@ -535,23 +500,17 @@ def refuse_matches(database: Path, frames: Frames, force: bool = False) -> None:
     """
     evidence = evidence_of(database)
     if evidence.features < MIN_FEATURES:
-        raise ValueError(
-            "pictures: expected hundreds of features to match, but got "
-            f"{evidence.features:.0f} in a picture; {_advice(evidence, frames)}"
-        )
+        got = f"{evidence.features:.0f} in a picture"
+        raise mismatch("pictures", "hundreds of features to match", got, _advice(evidence, frames))
     if force:
         return
     if evidence.shift < STILL:
-        raise ValueError(
-            f"camera: expected one that moves, but got matches that shift by {100 * evidence.shift:.1f} % of "
-            "the picture at most; walk around the subject while filming, or go on with force=true"
-        )
+        got = f"matches that shift by {100 * evidence.shift:.1f} % of the picture at most"
+        advice = "walk around the subject while filming, or go on with force=true"
+        raise mismatch("camera", "one that moves", got, advice)
     if evidence.unrotated < TURNED:
-        raise ValueError(
-            "camera: expected one that moves around things near and far, but got one where "
-            f"{100 - 100 * evidence.unrotated:.0f} % of all shift is explained by turning it; {_WALK}, or "
-            "go on with force=true"
-        )
+        got = f"one where {100 - 100 * evidence.unrotated:.0f} % of all shift is explained by turning it"
+        raise mismatch("camera", _MOVES_AROUND, got, f"{_WALK}, or go on with force=true")
 
 
 class TooFewRegistered(ValueError):
@@ -577,33 +536,27 @@ def refuse_poses(
     """
     registered, total = 0 if found is None else len(found.cameras), len(frames.times)
     if database is None and registered < MIN_MODEL:
-        raise ValueError(
-            f"colmap: expected a model of at least {MIN_MODEL} pictures, but got {registered}; set another"
-        )
+        raise mismatch("colmap", f"a model of at least {MIN_MODEL} pictures", registered, "set another")
     if database is not None and registered < max(MIN_MODEL, MIN_REGISTERED * total):
         advice = _advice(evidence_of(database), frames)
-        raise TooFewRegistered(
-            f"poses: expected most of {total} pictures registered, but got {registered}; {advice}"
-        )
+        expected = f"most of {total} pictures registered"
+        raise TooFewRegistered(str(mismatch("poses", expected, registered, advice)))
     for name, camera in found.cameras.items():
-        if (camera.width, camera.height) != frames.sizes[name]:
-            raise ValueError(
-                "colmap: expected cameras of {} x {} pixels, as the pictures, but got {} x {}; set images= to"
-                " the pictures that the model was made from".format(
-                    *frames.sizes[name], camera.width, camera.height
-                )
-            )
+        size = camera.width, camera.height
+        if size != frames.sizes[name]:
+            advice = "set images= to the pictures that the model was made from"
+            expected = f"cameras of {by(frames.sizes[name])} pixels, as the pictures"
+            raise mismatch("colmap", expected, by(size), advice)
     refuse_lenses(found)
-    poses = [camera.camera_to_world for camera in found.cameras.values()]
     if database is None and not force and not _has_points_ahead(found):
+        poses = [camera.camera_to_world for camera in found.cameras.values()]
         if ways := other_readings(poses, _READINGS):
-            raise ValueError(
-                "colmap: expected world-to-camera poses with OpenCV's axes, but got cameras that look at one "
-                f"thing only if {', or if '.join(ways)}; write them anew, or force=true if they are right"
-            )
+            got = f"cameras that look at one thing only if {', or if '.join(ways)}"
+            advice = "write them anew, or force=true if they are right"
+            raise mismatch("colmap", "world-to-camera poses with OpenCV's axes", got, advice)
         if float(np.abs(found.centers - found.centers[0]).max()) <= _SAME_PLACE * np.abs(found.centers).max():
-            got = "all in one place, which tells nothing of depth; compare the poses"
-            raise ValueError(f"colmap: expected cameras that move, but got {got}, or force=true if it is so")
+            got = "all in one place, which tells nothing of depth"
+            raise mismatch("colmap", "cameras that move", got, "compare the poses, or force=true if it is so")
     refuse_misfit(found)
 
 
@@ -618,12 +571,10 @@ def refuse_lenses(found: Reconstruction) -> None:
         try:
             check_lens(camera, "lens")
             if degrees > MAX_DEGREES:
-                raise SceneError(f"lens: expected at most {MAX_DEGREES:.0f} degrees, but got {degrees:.0f}")
+                raise mismatch("lens", f"at most {MAX_DEGREES:.0f} degrees", f"{degrees:.0f}")
         except SceneError as error:
-            text = str(error).partition(";")[0]
-            raise ValueError(
-                f"{text}; if it is a fisheye, film without it or undistort first; else {_WALK}"
-            ) from error
+            advice = f"if it is a fisheye, film without it or undistort first; else {_WALK}"
+            raise ValueError(f"{str(error).partition(';')[0]}; {advice}") from error
 
 
 def refuse_misfit(found: Reconstruction) -> None:
@@ -637,15 +588,11 @@ def refuse_misfit(found: Reconstruction) -> None:
     extent = np.linalg.norm(found.centers - np.median(found.centers, axis=0), axis=1).max()
     parallax = extent / np.median(found.distances())
     if parallax < MIN_PARALLAX:
-        raise ValueError(
-            f"camera: expected one that moves around things near and far, but got places that are "
-            f"{100 * parallax:.2f} % of the distance apart; {_WALK}"
-        )
+        got = f"places that are {100 * parallax:.2f} % of the distance apart"
+        raise mismatch("camera", _MOVES_AROUND, got, _WALK)
     if found.error > MAX_ERROR:
-        raise ValueError(
-            f"poses: expected a reprojection error of at most {MAX_ERROR} pixels, but got {found.error:.1f}; "
-            "give masks= of what moves"
-        )
+        expected = f"a reprojection error of at most {MAX_ERROR} pixels"
+        raise mismatch("poses", expected, f"{found.error:.1f}", "give masks= of what moves")
 
 
 def _has_points_ahead(found: Reconstruction) -> bool:
@@ -663,10 +610,9 @@ def errors_of(model: pycolmap.Reconstruction) -> dict[str, float]:
     for image in model.images.values():
         ends = [(p.xy, model.points3D[p.point3D_id].xyz) for p in image.points2D if p.has_point3D()]
         if image.has_pose and ends:
-            fallen = ((xy, image.project_point(xyz)) for xy, xyz in ends)
-            errors[image.name] = float(
-                np.mean([np.linalg.norm(xy - at) for xy, at in fallen if at is not None])
-            )
+            pairs = ((xy, image.project_point(xyz)) for xy, xyz in ends)
+            away = [np.linalg.norm(xy - fallen) for xy, fallen in pairs if fallen is not None]
+            errors[image.name] = float(np.mean(away))
     return errors
 
 
@@ -717,15 +663,12 @@ def unrotated(first: np.ndarray, second: np.ndarray, focal: float) -> float:
 def _advice(evidence: Evidence, frames: Frames) -> str:
     """Say what the evidence calls for."""
     if frames.edges > BLURRED:
-        return (
-            f"edges are {frames.edges:.0f} pixels wide (of 640): the pictures are blurred; film slower, "
-            "and in more light"
-        )
+        told = f"edges are {frames.edges:.0f} pixels wide (of 640): the pictures are blurred"
+        return f"{told}; film slower, and in more light"
     if evidence.features < MIN_FEATURES and frames.masks is not None:
         return "there is no texture but on what the masks call moving; put textured things around it"
     if evidence.features < MIN_FEATURES:
         return "there is hardly any texture; put textured things around the subject, as newspapers"
     more = "take more pictures" if frames.originals else "take more frames (frames=)"
-    return (
-        f"film slower and with more of what stands still in the picture, {more}, or give masks= of what moves"
-    )
+    slower = "film slower and with more of what stands still in the picture"
+    return f"{slower}, {more}, or give masks= of what moves"

@@ -19,10 +19,10 @@ from reprlib import repr as short
 import numpy as np
 import torch
 
-from forewarp.capture.frames import Step, shrunk
+from forewarp.capture.frames import Step, write_smaller
 from forewarp.data.directions import opposite
 from forewarp.data.files import mismatch, number
-from forewarp.data.images import by, read_image, write_image
+from forewarp.data.images import by, read_image
 from forewarp.data.posed_video import PosedShot, write_scene
 from forewarp.files import folder_written_whole, write_json
 from forewarp.ops.gaussians import rotations
@@ -70,9 +70,7 @@ def capture_record3d(scan: Path, out: Path, step: Step, mark: str, frames: int |
                     (folder / "images").mkdir(exist_ok=True)
                     (folder / "images" / name).write_bytes(read.member(f"rgbd/{i}.jpg"))
                     pixels = read_image(folder / "images" / name, read.size)[..., :3].numpy()
-                    height, width = (n // _SMALLER for n in pixels.shape[:2])
-                    small = shrunk(pixels[: height * _SMALLER, : width * _SMALLER], height, width)
-                    write_image(folder / f"images_{_SMALLER}" / name, small)
+                    write_smaller(folder, name, pixels, _SMALLER)
                     time, evidence = (read.times[i] - first) / ((last - first) or 1.0), read.confidence(i)
                     camera = read.camera(i)
                     yield PosedShot(name, camera, pixels, time, depth=read.depth(i), confidence=evidence)
@@ -107,14 +105,14 @@ class _Scan:
         if not isinstance(about, dict):
             raise mismatch(f"{path}: metadata", "an object", short(about))
         self.about = about
-        self.size, self.of_depth = (
-            tuple(int(self._number(key, about.get(key), 1, most)) for key in keys)
-            for keys, most in ((("w", "h"), _MOST_SIDE), (("dw", "dh"), _MOST_DEPTH_SIDE))
-        )
+        sides = [int(self._number(key, about.get(key), 1, _MOST_SIDE)) for key in ("w", "h")]
+        sides += [int(self._number(key, about.get(key), 1, _MOST_DEPTH_SIDE)) for key in ("dw", "dh")]
+        self.size, self.of_depth = tuple(sides[:2]), tuple(sides[2:])
         self.poses = self._rows("poses", 7)
         if not self.poses:
             raise mismatch(f"{path}: metadata: poses", "a pose of each frame", "none")
-        self.intrinsics = [self._of_matrix()] * len(self.poses)
+        matrix = self._rows("K", 1, 9)
+        self.intrinsics = [[matrix[k][0] for k in (0, 4, 6, 7)]] * len(self.poses)
         if about.get("perFrameIntrinsicCoeffs"):
             self.intrinsics = self._rows("perFrameIntrinsicCoeffs", 4, len(self.poses))
         if about.get("frameTimestamps"):
@@ -128,9 +126,8 @@ class _Scan:
         (x, y, z, w, *place), pose = self.poses[i], torch.eye(4, dtype=torch.float64)
         q = torch.tensor([w, x, y, z], dtype=torch.float64)
         if not 0.9 < float(q.norm()) < 1.1:
-            raise mismatch(
-                f"{self.path}: metadata: poses[{i}]", "a quaternion of length 1", f"{float(q.norm()):g}"
-            )
+            where = f"{self.path}: metadata: poses[{i}]"
+            raise mismatch(where, "a quaternion of length 1", f"{float(q.norm()):g}")
         pose[:3, :3] = rotations(q[None])[0]
         pose[:3, 3] = torch.tensor(place, dtype=torch.float64)
         fx, fy, cx, cy = self.intrinsics[i]
@@ -176,18 +173,11 @@ class _Scan:
     def _rows(self, key: str, columns: int, count: int | None = None) -> list[list[float]]:
         rows, where = self.about.get(key), f"{self.path}: metadata: {key}"
         if not isinstance(rows, list) or (count is not None and len(rows) != count):
-            expected = "a list" if count is None else f"a list of {count}, as there are poses"
-            raise mismatch(where, expected, short(rows))
+            raise mismatch(where, "a list" if count is None else f"a list of {count}", short(rows))
         rows = [row if isinstance(row, list) else [row] for row in rows]
         if wrong := [row for row in rows if len(row) != columns]:
-            raise mismatch(where, f"{columns} numbers for each frame", short(wrong[0]))
+            raise mismatch(where, f"{columns} numbers in each row", short(wrong[0]))
         return [[self._number(key, value) for value in row] for row in rows]
-
-    def _of_matrix(self) -> list[float]:
-        matrix = self.about.get("K")
-        if not isinstance(matrix, list) or len(matrix) != 9:
-            raise mismatch(f"{self.path}: metadata: K", "9 numbers", short(matrix))
-        return [self._number("K", matrix[k]) for k in (0, 4, 6, 7)]
 
     def _number(self, key: str, value: object, low: float = -_MOST_UNITS, high: float = _MOST_UNITS) -> float:
         return number(value, f"{self.path}: metadata: {key}", low, high)

@@ -5,17 +5,17 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 
-import cv2
 import numpy as np
 import torch
 from torch import Tensor
 
-from forewarp.capture.frames import Frames, Progress, Source, shrunk
-from forewarp.capture.motion import moving_masks, resting_masks
+from forewarp.capture.frames import Frames, Progress, Source, read_mask, write_mask, write_smaller
+from forewarp.capture.motion import moving_masks, resized_mask, resting_masks
 from forewarp.capture.poses import Reconstruction
-from forewarp.data.images import common_header, read_image, write_image
+from forewarp.data.images import by, common_header, read_image
 from forewarp.data.posed_video import SCALES, PosedShot, write_scene
 from forewarp.drawing.images import draw_discs, sample_lines
 from forewarp.scene.box import Box
@@ -146,21 +146,18 @@ def write(
         how many times smaller the copies are, and which share of all pixels moves; None without masks.
     """
     names = sorted(found.cameras, key=lambda name: frames.times[name])
-    first, last = frames.times[names[0]], frames.times[names[-1]]
-    shortest = min(min(camera.width, camera.height) for camera in found.cameras.values())
-    has_alpha = common_header([frames.folder / name for name in names], one_size=False).has_alpha
-    scales = [s for s in SCALES[1:] if shortest // s >= _MIN_SIDE]
-    cameras, times = [found.cameras[name] for name in names], {frames.times[name] for name in names}
-    is_film = (
-        not frames.cameras and len(times) == len(names) and len({(c.width, c.height) for c in cameras}) == 1
-    )
+    paths, cameras = [frames.folder / name for name in names], [found.cameras[name] for name in names]
+    times, sizes = [frames.times[name] for name in names], [(c.width, c.height) for c in cameras]
+    scales = [s for s in SCALES[1:] if min(map(min, sizes)) // s >= _MIN_SIDE]
+    has_alpha = common_header(paths, one_size=False).has_alpha
+    is_film = not frames.cameras and len({*times}) == len(names) and len({*sizes}) == 1
     masks, moving_from, share = [None] * len(names), None, 0.0
     if frames.masks is not None:
         moving_from = frames.masks_from
-        masks = (read_image(frames.masks / f"{name}.png")[..., 0].numpy() == 0 for name in names)
+        masks = (read_mask(frames.masks / f"{name}.png") for name in names)
     elif is_film:
         found_masks = []
-        for mask in moving_masks([frames.folder / name for name in names], cameras):
+        for mask in moving_masks(paths, cameras):
             found_masks.append(mask)
             progress(len(found_masks), 2 * len(names))
         if 2 * sum(mask is not None for mask in found_masks) > len(names):
@@ -169,47 +166,38 @@ def write(
             masks = [nothing if mask is None else mask for mask in found_masks]
     resting = {}
     if moving_from is not None and is_film:
-        middle = middle_of(frames.times[name] for name in names)
-        near = sorted(range(len(names)), key=lambda i: abs(frames.times[names[i]] - middle))[:_RESTING]
-        found_masks = resting_masks([frames.folder / name for name in names], cameras, near)
-        resting = {names[i]: mask for i, mask in zip(near, found_masks) if mask is not None}
+        middle = middle_of(times)
+        near = sorted(range(len(names)), key=lambda i: abs(times[i] - middle))[:_RESTING]
+        resting = dict(zip(near, resting_masks(paths, cameras, near)))
 
     def shots() -> Iterator[PosedShot]:
         nonlocal share
-        for done, (name, moving) in enumerate(zip(names, masks), 1):
-            size = cameras[done - 1].width, cameras[done - 1].height
+        for i, (name, moving) in enumerate(zip(names, masks)):
             if moving is not None:
-                moving = cv2.resize(moving.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
+                moving = resized_mask(moving, sizes[i])
                 if burnt is not None:  # it moves against the world, but is none of it
                     moving = moving & ~burnt
                 share += float(moving.mean()) / len(names)
-            pixels = read_image(frames.folder / name).numpy()
+            rests = None if resting.get(i) is None else resized_mask(resting[i], sizes[i])
+            pixels = read_image(paths[i]).numpy()
             pixels = pixels if has_alpha else pixels[..., :3]
-            for scale in scales:  # the mean of each block; what is left at the ends is left out
-                height, width = (n // scale for n in pixels.shape[:2])
-                small = shrunk(pixels[: height * scale, : width * scale], height, width)
-                write_image(folder / f"images_{scale}" / name, small)
-            time = (frames.times[name] - first) / (last - first) if last > first else 0.0
+            for scale in scales:
+                write_smaller(folder, name, pixels, scale)
+            time = (times[i] - times[0]) / (times[-1] - times[0]) if times[-1] > times[0] else 0.0
             rig = {"taken_by": frames.cameras.get(name), "moment": frames.moments.get(name)}
-            rests = resting.get(name)
-            if rests is not None:
-                rests = cv2.resize(rests.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
-            yield PosedShot(name, found.cameras[name], pixels, time, moving=moving, resting=rests, **rig)
-            progress(len(names) + done, 2 * len(names))
+            yield PosedShot(name, cameras[i], pixels, time, moving=moving, resting=rests, **rig)
+            progress(len(names) + i + 1, 2 * len(names))
 
-    options = {"near": limits.near, "far": limits.far, "aabb": limits.box} if limits else {}
-    if moving_from is not None:
-        options["moving_from"] = moving_from
-    if in_seconds:
-        options["seconds"] = last - first
     if burnt is not None:
-        options["mask"] = MASK
         for scale in (1, *scales):
             height, width = (n // scale for n in burnt.shape)
             blocks = burnt[: height * scale, : width * scale].reshape(height, scale, width, scale)
-            small = np.where(blocks.any((1, 3)), 0, 255).astype(np.uint8)
-            write_image(folder / (MASK if scale == 1 else MASK.replace("/", f"_{scale}/")), small)
-    write_scene(folder, shots(), points=found.sure(), **options)
+            name = MASK if scale == 1 else MASK.replace("/", f"_{scale}/")
+            write_mask(folder / name, blocks.any((1, 3)))
+    told = {"near": limits.near, "far": limits.far, "aabb": limits.box} if limits else {}
+    told |= {"moving_from": moving_from, "mask": None if burnt is None else MASK}
+    told["seconds"] = times[-1] - times[0] if in_seconds else None
+    write_scene(folder, shots(), points=found.sure(), **told)
     return scales, None if moving_from is None else share
 
 
@@ -292,19 +280,21 @@ def facts_of(
         "burnt_in": None if burnt is None else {"share": float(burnt.mean()), "places": _places_of(burnt)},
         "absent": list(found.absent),
         "seconds": max(times) - min(times) if source.video is not None else None,
-        "reprojection_error": found.error if limits else None,
-        "points": len(found.points),
-        "sure_points": len(found.sure()),
         "camera": lens_facts(next(iter(found.cameras.values()))),
         # The way of the camera, where the median distance of what it sees is 1.
         "path": float(np.linalg.norm(np.diff(found.centers, axis=0), axis=1).sum()),
-        "near": limits and limits.near,
-        "far": limits and limits.far,
         "has_nearer": limits is not None and limits.has_nearer,
-        "box": limits and [*limits.box.low, *limits.box.high],
+        **facts_of_space(found, limits),
         "scales": scales,
         "moving": moving,
     }
+
+
+def facts_of_space(found: Reconstruction, limits: Limits | None) -> dict:
+    """Gather how well points and cameras fit, and the limits, None where they are not known."""
+    facts = {"reprojection_error": found.error if limits else None, "points": len(found.points)}
+    facts |= {"sure_points": len(found.sure()), "near": limits and limits.near, "far": limits and limits.far}
+    return facts | {"box": limits and [*limits.box.low, *limits.box.high]}
 
 
 def lens_facts(camera: Camera) -> dict:
@@ -321,41 +311,41 @@ def _places_of(mask: np.ndarray) -> list[str]:
     >>> _places_of(np.arange(81).reshape(9, 9) < 3)
     ['top left']
     """
-    names = [
-        f"{row} {column}" for row in ("top", "middle", "bottom") for column in ("left", "middle", "right")
-    ]
-    parts = (part for rows in np.array_split(mask, 3) for part in np.array_split(rows, 3, axis=1))
-    return [name for name, part in zip(names, parts) if part.sum() >= 0.2 * mask.sum()]
+    parts = [part for rows in np.array_split(mask, 3) for part in np.array_split(rows, 3, axis=1)]
+    names = product(("top", "middle", "bottom"), ("left", "middle", "right"))
+    return [" ".join(name) for name, part in zip(names, parts) if part.sum() >= 0.2 * mask.sum()]
+
+
+def space_line(facts: dict) -> str:
+    """Say in words how large the box is, and where near and far are."""
+    size = by(f"{high - low:.2f}" for low, high in zip(facts["box"][:3], facts["box"][3:]))
+    return f"box: {size}, near {facts['near']:.2f}, far {facts['far']:.2f}"
+
+
+def moving_line(facts: dict) -> list[str]:
+    """Say in a line how much moves, where that is known."""
+    if facts["moving"] is None:
+        return []
+    return [f"moving: {facts['moving']:.0%} of the pixels; test frames are scored there and elsewhere"]
 
 
 def summary(facts: dict) -> list[str]:
     """Say what was found in a few lines."""
-    camera, box = facts["camera"], facts["box"]
-    lines = [
-        f"registered: {facts['registered']} of {facts['pictures']} pictures, {camera['width']} x "
-        f"{camera['height']} pixels",
-        f"camera: {camera['degrees']:.0f} degrees wide; its path is {facts['path']:.2f} long",
-        "points: none; box, near and far are derived when the scene is read",
-    ]
-    if box is not None:
-        size = " x ".join(f"{high - low:.2f}" for low, high in zip(box[:3], box[3:]))
+    camera = facts["camera"]
+    registered = f"registered: {facts['registered']} of {facts['pictures']} pictures, "
+    registered += f"{camera['width']} x {camera['height']} pixels"
+    path = f"camera: {camera['degrees']:.0f} degrees wide; its path is {facts['path']:.2f} long"
+    points = "points: none; box, near and far are derived when the scene is read"
+    if facts["box"] is not None:
         all_sure = facts["sure_points"] == facts["points"]
         sure = "" if all_sure else f", {facts['sure_points']:,} of them sure"
-        lines[0] += f", reprojection error {facts['reprojection_error']:.2f} pixels"
-        lines[1] += ", where what it sees is 1 away"
-        lines[2] = (
-            f"points: {facts['points']:,}{sure}; box {size}, near {facts['near']:.2f}, far {facts['far']:.2f}"
-        )
-    if facts["why"]:
-        lines.insert(0, f"frames: {facts['pictures']} of {facts['found']}; {facts['why']}")
-    if facts["moving"] is not None:
-        lines.append(
-            f"moving: {facts['moving']:.0%} of the pixels; test frames are scored there and elsewhere"
-        )
-    if facts["absent"]:
-        lines.append(
-            f"left out: {len(facts['absent'])} cameras whose picture is not there ({facts['absent'][0]})"
-        )
+        registered += f", reprojection error {facts['reprojection_error']:.2f} pixels"
+        path += ", where what it sees is 1 away"
+        points = f"points: {facts['points']:,}{sure}; {space_line(facts).replace(':', '', 1)}"
+    lines = [f"frames: {facts['pictures']} of {facts['found']}; {facts['why']}"] if facts["why"] else []
+    lines += [registered, path, points, *moving_line(facts)]
+    if absent := facts["absent"]:
+        lines.append(f"left out: {len(absent)} cameras whose picture is not there ({absent[0]})")
     if facts["assumed"]:
         lines.append(f"assumed: {facts['assumed']}")
     if burnt := facts["burnt_in"]:

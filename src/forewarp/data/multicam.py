@@ -196,7 +196,7 @@ def read_scene(
 
 
 def write_poses(folder: str | Path, cameras: Sequence[Camera], *, near: float, far: float) -> None:
-    """Write ``poses_bounds.npy``; films are written by ``synth.films.write_scene``.
+    """Write ``poses_bounds.npy``, which is all of a scene but the films.
 
     Args:
         folder: of the scene.

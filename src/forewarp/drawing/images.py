@@ -306,10 +306,7 @@ def _write_mp4(path: Path, frames: Iterable[np.ndarray], fps: float, sound: Path
     first = next(frames)
     # The default block of 16 would stretch the image; 2 is the smallest that the codec allows.
     options = {"fps": fps, "quality": 8, "macro_block_size": 2, "ffmpeg_log_level": "error"}
-    options["output_params"] = [
-        "-colorspace",
-        "smpte170m",
-    ]  # as ffmpeg converts; else players take HD for BT.709
+    options["output_params"] = ["-colorspace", "smpte170m"]  # as ffmpeg converts; else HD shows as BT.709
     if sound is not None:
         options |= {"audio_path": str(sound), "audio_codec": "aac"}
     writer = imageio_ffmpeg.write_frames(str(path), first.shape[1::-1], **options)

@@ -12,6 +12,7 @@ from omegaconf import DictConfig, open_dict
 
 from forewarp.clock import Clock
 from forewarp.data.checks import remarks
+from forewarp.data.files import mismatch
 from forewarp.methods.effect import Evidence, Residual, decide
 from forewarp.methods.method import Method
 from forewarp.planning.plan_file import read_plan, write_plan
@@ -51,10 +52,8 @@ def make_plan(config: DictConfig, overrides: Sequence[str]) -> dict:
     run.check_device()  # before a folder is made
     method = getattr(run.model, "func", run.model)
     if not getattr(method, "effects", ()):
-        raise ValueError(
-            f"model: expected a method with effects to choose from, but {config.model.name} has none; use "
-            "model=particles, model=forward or model=backward, or leave out effects=auto"
-        )
+        advice = "use model=particles, model=forward or model=backward, or leave out effects=auto"
+        raise mismatch("model", "a method with effects to choose from", f"{config.model.name}", advice)
     refuse(config, typed)
     run.datamodule.setup("fit")
     tell(remarks(run.datamodule.scene))
@@ -65,10 +64,8 @@ def make_plan(config: DictConfig, overrides: Sequence[str]) -> dict:
     if file.is_file():
         made = read_plan(file, trust_of(config.get("trust")), typed)
         if made["of"] != asked:
-            raise ValueError(
-                f"plan.folder: expected the plan of this command and data, but got another in {file}; "
-                "use another plan.folder, or delete it"
-            )
+            expected, advice = "the plan of this command and data", "use another plan.folder, or delete it"
+            raise mismatch("plan.folder", expected, f"another in {file}", advice)
         return made | {"file": str(file), "found": True}
     clock = Clock(config.budget.clock)
     with clock.running():
@@ -163,7 +160,5 @@ def refuse(config: DictConfig, typed: Sequence[str]) -> None:
         raise ValueError("resume: expected nothing where a run is planned; leave it out")
     for override in typed:
         if override.startswith("~"):
-            raise ValueError(
-                f"{override}: expected overrides that set a key, as a plan keeps them; "
-                f"use {override[1:]}=null"
-            )
+            expected = "expected overrides that set a key, as a plan keeps them"
+            raise ValueError(f"{override}: {expected}; use {override[1:]}=null")

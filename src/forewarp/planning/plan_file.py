@@ -40,10 +40,8 @@ def read_plan(file: Path, trust: Sequence[str] = (), typed: Sequence[str] = ()) 
         allowed = all(isinstance(override, str) and _is_harmless(override) for override in others)
     except (OSError, ValueError, yaml.YAMLError, TypeError, KeyError, RecursionError) as error:
         reason = getattr(error, "strerror", None) or type(error).__name__
-        raise ValueError(
-            f"plan: expected a file that forewarp-plan wrote, but got {file} ({reason}); "
-            "use plan=<folder of a plan>/plan.yaml"
-        ) from error
+        told = f"plan: expected a file that forewarp-plan wrote, but got {file} ({reason})"
+        raise ValueError(f"{told}; use plan=<folder of a plan>/plan.yaml") from error
     where = f"plan: expected overrides that a plan has, but got others in {file}"
     if not allowed:
         raise ValueError(f"{where}; make it anew")
@@ -84,9 +82,8 @@ def with_plan(name: str, arguments: list[str]) -> list[str]:
     for override in typed:
         other_model = override.startswith("model=") and override not in planned
         if override.startswith("resume=") or other_model:
-            raise ValueError(
-                f"{override}: expected no such override beside plan={files[-1]}; leave one of them out"
-            )
+            told = f"expected no such override beside plan={files[-1]}"
+            raise ValueError(f"{override}: {told}; leave one of them out")
     file = files[-1].replace("\\", "\\\\").replace("'", "\\'")
     kept = [*planned, f"planned='{file}'", "effects=given"]
     return without_switched_off(merged([*kept, *own_folder(typed)], typed))

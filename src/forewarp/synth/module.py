@@ -10,14 +10,8 @@ from pathlib import Path
 
 from filelock import FileLock
 
+from forewarp.data import module
 from forewarp.data.files import LOCK, RECORD, mismatch, read_json
-from forewarp.data.module import (
-    DNeRFDataModule,
-    HyperNeRFDataModule,
-    LegoCompleteDataModule,
-    NHRDataModule,
-    SceneDataModule,
-)
 from forewarp.progress import Counted
 from forewarp.scene.frame import Scene
 from forewarp.synth import recordings, scenes
@@ -46,7 +40,7 @@ def write_whole(
         folder: folder of the scene; an existing one is replaced.
         dataset: a key of ``WRITERS``.
         arguments: arguments of the writer; recorded in the scene's ``synthesis.json``.
-        workers, progress: see ``raycast.RenderPool``; the files do not depend on them.
+        workers, progress: see ``raycast.render_all``; the files do not depend on them.
 
     Raises:
         SceneError: for a bad argument, or a folder that cannot be written to.
@@ -80,7 +74,7 @@ class Synthetic:
     """
 
     dataset = "dnerf"
-    suspects = SceneDataModule.suspects  # its poses and times are right
+    suspects = module.SceneDataModule.suspects  # its poses and times are right
 
     def __init__(self, root: str | Path, scene: str, *, synthesis: Mapping, **arguments) -> None:
         super().__init__(root, scene, **arguments)
@@ -118,23 +112,23 @@ class Synthetic:
             write_whole(self.folder, self.dataset, self.synthesis, progress=progress)
 
 
-class SyntheticDataModule(Synthetic, DNeRFDataModule):
+class SyntheticDataModule(Synthetic, module.DNeRFDataModule):
     """The procedural scene ``root/scene`` in D-NeRF's layout."""
 
 
-class SyntheticLegoCompleteDataModule(Synthetic, LegoCompleteDataModule):
+class SyntheticLegoCompleteDataModule(Synthetic, module.LegoCompleteDataModule):
     """The procedural scene ``root/scene``, one of several that are synthesised together into ``root``."""
 
     dataset = "lego_complete"
 
 
-class SyntheticHyperNeRFDataModule(Synthetic, HyperNeRFDataModule):
+class SyntheticHyperNeRFDataModule(Synthetic, module.HyperNeRFDataModule):
     """The procedural capture ``root/scene`` by a rig of two phones in a room."""
 
     dataset = "hypernerf"
 
 
-class SyntheticNHRDataModule(Synthetic, NHRDataModule):
+class SyntheticNHRDataModule(Synthetic, module.NHRDataModule):
     """The procedural recording ``root/scene`` by a dome of cameras."""
 
     dataset = "nhr"

@@ -11,19 +11,9 @@ from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
-import torch
 
-from forewarp.ops.backend import cores
 from forewarp.scene.camera import Camera
-from forewarp.synth.raycast import (
-    LIGHT_RADIUS,
-    SAMPLES_A_PROCESS,
-    Posed,
-    by_processes,
-    camera_rays,
-    shaded,
-    surface_points,
-)
+from forewarp.synth.raycast import LIGHT_RADIUS, Posed, by_processes, camera_rays, shaded, surface_points
 from forewarp.synth.shapes import Material, Part, box, sphere
 from forewarp.synth.vehicle import rotation, shift
 from forewarp.synth.world import (
@@ -112,27 +102,20 @@ def near_movers(world: World, times: Iterable[float], cameras: Sequence[Camera])
     corners: dict[str, list] = {name: [] for name in MOVERS}
     for time, camera in zip(times, cameras):
         for name, placed in placed_movers(world, time).items():
-            corners[name].append(camera.project(torch.from_numpy(placed))[0].numpy())
-    width, height = cameras[0].width, cameras[0].height
-    near = np.zeros((height, width), bool)
+            corners[name].append(camera.project(placed)[0].numpy())
+    size = cameras[0].width, cameras[0].height
+    near = np.zeros(size[::-1], bool)
     for places in map(np.concatenate, corners.values()):
-        (left, top), (right, bottom) = places.min(0) - _PAD, places.max(0) + _PAD
-        columns, rows = (
-            slice(*np.clip((a, b), 0, most).astype(int))
-            for a, b, most in ((left, right, width), (top, bottom, height))
-        )
-        near[rows, columns] = True
+        ends = np.stack([places.min(0) - _PAD, places.max(0) + _PAD])
+        (left, top), (right, bottom) = ends.clip(0, size).astype(int)
+        near[top:bottom, left:right] = True
     return near
 
 
 def placed_movers(world: World, time: float) -> dict[str, np.ndarray]:
     """Return the vertices (V, 3) of each mover at a time, by name."""
     maps = world.subject.joints(time)
-    return {
-        part.name: part.vertices @ maps[part.joint][:3, :3].T + maps[part.joint][:3, 3]
-        for part in world.parts
-        if part.name in MOVERS
-    }
+    return {part.name: part.placed(maps) for part in world.parts if part.name in MOVERS}
 
 
 @lru_cache(4)
@@ -164,9 +147,7 @@ class Film:
     def __init__(self, still: np.ndarray) -> None:
         self.still, self.changes = still, []
 
-    def add(
-        self, pixels: np.ndarray, colors: np.ndarray, is_mover: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
+    def add(self, pixels: np.ndarray, colors: np.ndarray, is_mover: np.ndarray) -> tuple:
         """Add a frame; return it, and bool (H, W), what moves.
 
         Args:
@@ -189,11 +170,7 @@ class Film:
 
 
 def filmed(
-    views: Sequence[Camera],
-    times: Sequence[Sequence[float]],
-    seconds: float,
-    samples: int,
-    workers: int | None,
+    views: Sequence[Camera], times: Sequence[list[float]], seconds: float, samples: int, workers: int | None
 ) -> Iterator:
     """Yield of each fixed camera what ``Film`` takes, then of each of its frames what ``Film.add`` takes.
 
@@ -211,8 +188,7 @@ def filmed(
                 yield seconds, time, view, samples, touched(time)
 
     pixels = sum(v.width * v.height * (1 + _TOUCHED * len(of_view)) for v, of_view in zip(views, times))
-    workers = workers or max(1, min(cores(), int(pixels * samples / SAMPLES_A_PROCESS)))
-    return by_processes(_shade, jobs(), workers)
+    return by_processes(_shade, jobs(), pixels * samples, workers)
 
 
 def _shade(seconds: float, time: float | None, view: Camera, samples: int, pixels: np.ndarray | None):
@@ -261,11 +237,7 @@ def still_points(world: World, cameras: Sequence[Camera], rng: np.random.Generat
 
 
 def views_of(
-    world: World,
-    times: Sequence[float],
-    cameras: Sequence[Camera],
-    face: np.ndarray,
-    barycentric: np.ndarray,
+    world: World, times: Sequence[float], cameras: Sequence[Camera], face: np.ndarray, barycentric: np.ndarray
 ) -> np.ndarray:
     """Count the images (N,) that show surface points, which move with what they lie on.
 
@@ -278,10 +250,9 @@ def views_of(
     counts = np.zeros(len(face), np.int64)
     for time, camera in zip(times, cameras):
         points, center = world.points(face, barycentric, time), camera.center.double().numpy()
-        pixel, depth = (values.numpy() for values in camera.project(torch.from_numpy(points)))
-        rows = np.flatnonzero(
-            (depth > 0) & (pixel >= 0).all(-1) & (pixel < (camera.width, camera.height)).all(-1)
-        )
+        pixel, depth = (values.numpy() for values in camera.project(points))
+        inside = ((pixel >= 0) & (pixel < (camera.width, camera.height))).all(-1)
+        rows = np.flatnonzero((depth > 0) & inside)
         away = points[rows] - center
         distance = np.linalg.norm(away, axis=-1)
         hits = Posed(world, time).first_hits(np.broadcast_to(center, away.shape), away / distance[:, None])

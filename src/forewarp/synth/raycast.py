@@ -232,11 +232,8 @@ def surface_points(
     # The square root makes the density even over the triangle.
     a, b = np.sqrt(rng.random(drawn)), rng.random(drawn)
     barycentric = np.stack([1 - a, a * (1 - b), a * b], -1)
-    point, normal, seen = (
-        _blended(barycentric, posed.corners[face]),
-        posed.normal[face],
-        np.zeros(drawn, bool),
-    )
+    point, normal = _blended(barycentric, posed.corners[face]), posed.normal[face]
+    seen = np.zeros(drawn, bool)
     for camera in cameras:
         towards = _unit(np.asarray(camera.center) - point)
         rows = np.flatnonzero(~seen & (_dot(normal, towards) > 0))
@@ -264,31 +261,29 @@ def render_all(
         progress: called with (images done, all images) after each.
         shadow_rays: shadow rays of each ray.
     """
-    pixels = sum(camera.width * camera.height for _, _, camera in views)
-    workers = workers or max(1, min(cores(), int(pixels * samples / SAMPLES_A_PROCESS)))
-    if workers == 1:
-        images = (render(*view, samples, shadow_rays) for view in views)
-    else:
-        images = _rendered_by_processes(views, samples, shadow_rays, workers)
+    samples_of_all = samples * sum(camera.width * camera.height for _, _, camera in views)
+    jobs = ((*view, samples, shadow_rays) for view in views)
+    return counted(by_processes(render, jobs, samples_of_all, workers), len(views), progress)
+
+
+def counted(images: Iterable, total: int, progress: Callable[[int, int], None] | None) -> Iterator:
+    """Yield images, and call ``progress`` with (images done, ``total``) as each comes."""
     for done, image in enumerate(images, 1):
         if progress is not None:
-            progress(done, len(views))
+            progress(done, total)
         yield image
 
 
-def _rendered_by_processes(views, samples: int, shadow_rays: int, workers: int):
-    jobs = ((w.motion, w.has_room, time, camera, samples, shadow_rays) for w, time, camera in views)
-    return by_processes(_render, jobs, workers)
-
-
-def by_processes(function: Callable, jobs: Iterable[tuple], workers: int) -> Iterator:
+def by_processes(function: Callable, jobs: Iterable[tuple], samples: float, workers: int | None) -> Iterator:
     """Yield ``function(*job)`` of each job, in order; with one worker in this process, else in others.
 
     Args:
         function: of a module, so that other processes find it.
         jobs: taken one by one, a few ahead of what is yielded.
-        workers: processes.
+        samples: of all jobs, about.
+        workers: processes; None: one per processor, fewer for few samples.
     """
+    workers = workers or max(1, min(cores(), int(samples / SAMPLES_A_PROCESS)))
     if workers == 1:
         yield from (function(*job) for job in jobs)
         return
@@ -308,13 +303,6 @@ def _begin() -> None:
     """Set up a new process: leave Ctrl-C to the parent, and use one thread."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     torch.set_num_threads(1)
-
-
-_world = lru_cache(4)(World)  # of a process
-
-
-def _render(motion: str, has_room: bool, *view) -> tuple[np.ndarray, np.ndarray]:
-    return render(_world(motion, has_room), *view)
 
 
 def _call(function: Callable, job: bytes):
@@ -347,10 +335,8 @@ def _intersector(corners: np.ndarray, some: np.ndarray):
         import trimesh
         from trimesh.ray.ray_pyembree import RayMeshIntersector
     except ImportError as error:
-        raise ImportError(
-            "making a scene: expected the packages trimesh and embreex, but they are missing; "
-            "install forewarp[synth]"
-        ) from error
+        expected = "making a scene: expected the packages trimesh and embreex, but they are missing"
+        raise ImportError(f"{expected}; install forewarp[synth]") from error
     rows = np.append(np.flatnonzero(some), -1)  # the last is what a ray without a hit gets
     faces = np.arange(3 * (len(rows) - 1)).reshape(-1, 3)
     caster = RayMeshIntersector(trimesh.Trimesh(corners[some].reshape(-1, 3), faces, process=False))

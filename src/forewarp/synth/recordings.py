@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import wave
 from collections.abc import Callable, Iterator
 from contextlib import closing
 from dataclasses import dataclass
@@ -19,31 +18,13 @@ from forewarp.data.multicam import write_poses
 from forewarp.data.posed_video import PosedShot
 from forewarp.drawing.images import write_video
 from forewarp.files import write_json
-from forewarp.ops.backend import cores
 from forewarp.scene.box import Box
 from forewarp.scene.camera import Camera, look_at
 from forewarp.scene.frame import middle_of
-from forewarp.synth.movers import (
-    HALL_HIGH,
-    HALL_LOW,
-    SHADOW_RAYS,
-    Film,
-    filmed,
-    hall,
-    moving_faces,
-    still_points,
-    views_of,
-)
-from forewarp.synth.raycast import (
-    SAMPLES_A_PROCESS,
-    Posed,
-    by_processes,
-    camera_rays,
-    render,
-    surface_points,
-)
+from forewarp.synth import movers
+from forewarp.synth.raycast import Posed, by_processes, camera_rays, counted, render, surface_points
 from forewarp.synth.scenes import UP, check_numbers
-from forewarp.synth.walks import Walk, cameras_of, direction
+from forewarp.synth.walks import Walk, cameras_of, direction, pinhole
 from forewarp.synth.world import World
 
 TRUTH = "truth"  # the folder, and the file's stem
@@ -114,38 +95,36 @@ def synthesize_multicam(
         raise mismatch("synchronised", "true or false", repr(synchronised), "set synchronised")
     views = rig(cameras, size, seed)
     clocks = _clocks(cameras, frames, synchronised, seed)
-    seconds = max(clock.end for clock in clocks)
-    clap = max(clock.offset for clock in clocks) / 2 + min(clock.end for clock in clocks) / 2
+    ends = [clock.times[-1] for clock in clocks]
+    seconds, clap = max(ends), max(clock.offset for clock in clocks) / 2 + min(ends) / 2
     remove(folder, f"{TRUTH}.json", "cam*.mp4", "poses_bounds.npy")
 
     def shots() -> Iterator[PosedShot]:
-        times, done = [[time / seconds for time in clock.times] for clock in clocks], 0
-        images = filmed(views, times, seconds, samples_per_pixel, workers)
+        times = [[time / seconds for time in clock.times] for clock in clocks]
+        images = movers.filmed(views, times, seconds, samples_per_pixel, workers)
         for k, (view, clock) in enumerate(zip(views, clocks)):
-            name, film = f"cam{k:02d}", Film(next(images))
+            name, film = f"cam{k:02d}", movers.Film(next(images))
             for number, time in enumerate(times[k]):
                 image, moving = film.add(*next(images))
                 shot = f"{name}_{number:04d}.jpg"
                 yield PosedShot(shot, view, image, time, moving=moving, taken_by=name)
-                done += 1
-                if progress is not None:
-                    progress(done, cameras * frames)
             sound = folder / f"{name}.wav"
             write_sound(sound, clock, clap, np.random.default_rng([seed, _SOUNDS, k]))
             frames_of_film = (torch.from_numpy(image).float() / 255 for image in film)
             write_video(folder / f"{name}.mp4", frames_of_film, fps=clock.rate, sound=sound)
             sound.unlink()
 
-    points = still_points(hall(seconds), views, np.random.default_rng([seed, _DRAWN]), POINTS)
+    points = movers.still_points(movers.hall(seconds), views, np.random.default_rng([seed, _DRAWN]), POINTS)
     told = {"seconds": seconds, "moving_from": "the program that made the film", "points": points}
-    limits = {"near": NEAR, "far": FAR, "aabb": Box(HALL_LOW, HALL_HIGH)}
-    posed_video.write_scene(folder / TRUTH, shots(), **limits, **told)
+    limits = {"near": NEAR, "far": FAR, "aabb": Box(movers.HALL_LOW, movers.HALL_HIGH)}
+    posed_video.write_scene(folder / TRUTH, counted(shots(), cameras * frames, progress), **limits, **told)
     if synchronised:
         write_poses(folder, views, near=NEAR, far=FAR)
-    told_of = [
-        {"name": f"cam{k:02d}", "offset": clock.offset, "fps": clock.rate, "frames": frames, **_told(view)}
-        for k, (view, clock) in enumerate(zip(views, clocks))
-    ]
+    told_of = []
+    for k, (c, clock) in enumerate(zip(views, clocks)):
+        about = {"name": f"cam{k:02d}", "offset": clock.offset, "fps": clock.rate, "frames": frames}
+        about |= {"w": c.width, "h": c.height, "fl_x": c.fx, "fl_y": c.fy, "cx": c.cx, "cy": c.cy}
+        told_of.append(about | {"camera_to_world": c.camera_to_world.tolist()})
     write_json(folder / f"{TRUTH}.json", {"clap": clap, "seconds": seconds, "cameras": told_of})
     return folder
 
@@ -154,14 +133,12 @@ def rig(count: int, size: int, seed: int) -> list[Camera]:
     """Place cameras on an arc, by turns low and high; focal lengths differ by up to 2 %."""
     rng, made = np.random.default_rng([seed, _LENSES]), []
     arc = min(MOST_ARC, STEP * (count - 1))
-    width, height = size, size * 3 // 8 * 2
     for k in range(count):
         azimuth = math.radians(MIDDLE + arc * (k / (count - 1) - 0.5))
         distance, rise = DISTANCE + rng.uniform(-0.12, 0.12), HEIGHTS[k % 2] + rng.uniform(-0.1, 0.1)
-        focal = rng.uniform(0.98, 1.02) * 0.5 * width / math.tan(0.5 * math.radians(VIEW_ANGLE))
         center = torch.tensor([distance * math.cos(azimuth), distance * math.sin(azimuth), rise])
-        pose = look_at(center.double(), torch.tensor(FOCUS), UP)
-        made.append(Camera(width, height, focal, focal, width / 2, height / 2, pose, NEAR, FAR))
+        zoom, shape = rng.uniform(0.98, 1.02), (size, size * 3 // 8 * 2)
+        made.append(pinhole(look_at(center, FOCUS, UP), shape, VIEW_ANGLE, NEAR, FAR, zoom=zoom))
     return made
 
 
@@ -178,40 +155,25 @@ class Clock:
         """Of the frames, seconds."""
         return [self.offset + number / self.rate for number in range(self.frames)]
 
-    @property
-    def end(self) -> float:
-        """Of the last frame, seconds."""
-        return self.times[-1]
-
 
 def _clocks(count: int, frames: int, synchronised: bool, seed: int) -> list[Clock]:
     if synchronised:
         return [Clock(0.0, RATES[1], frames)] * count
     latest = min(LATEST, LATEST_SHARE * (frames - 1) / RATES[1])
     offsets = np.random.default_rng([seed, _OFFSETS]).uniform(0, latest, count)
-    first = offsets.min()
-    return [Clock(float(at - first), RATES[k % 2], frames) for k, at in enumerate(offsets)]
-
-
-def _told(camera: Camera) -> dict:
-    """Tell a pinhole camera: camera-to-world with OpenCV's axes, metres; the rest in pixels."""
-    inner = {"w": camera.width, "h": camera.height, "fl_x": camera.fx, "fl_y": camera.fy}
-    inner |= {"cx": camera.cx, "cy": camera.cy}
-    return inner | {"camera_to_world": camera.camera_to_world.tolist()}
+    return [Clock(float(at), RATES[k % 2], frames) for k, at in enumerate(offsets - offsets.min())]
 
 
 def write_sound(path: Path, clock: Clock, clap: float, rng: np.random.Generator) -> None:
     """Write what a camera hears as WAV: noise of its own, and the clap at ``clap`` seconds for all."""
+    from scipy.io import wavfile  # slow to load
+
     since = clock.offset + np.arange(round(clock.frames / clock.rate * HERTZ)) / HERTZ - clap
     tones = sum(np.sin(2 * np.pi * tone * since) for tone in TONES) / len(TONES)
     heard = LOUD * np.where(since > 0, np.exp(-since.clip(0) / FADE) * tones, 0)
     samples = heard + NOISE * rng.normal(size=len(since))
     path.parent.mkdir(parents=True, exist_ok=True)
-    with wave.open(str(path), "wb") as file:
-        file.setnchannels(1)
-        file.setsampwidth(2)
-        file.setframerate(HERTZ)
-        file.writeframes((32767 * samples.clip(-1, 1)).astype("<i2").tobytes())
+    wavfile.write(path, HERTZ, (32767 * samples.clip(-1, 1)).astype("<i2"))
 
 
 def synthesize_iphone(
@@ -252,62 +214,56 @@ def synthesize_iphone(
     check_numbers(samples_per_pixel, workers, **numbers)
     whole(size, "size", 12, multiple=6)
     seconds, times = (frames - 1) / FPS, np.linspace(0, 1, frames).tolist()
-    world, shape = hall(seconds), (size, size * 4 // 3)
+    world, shape = movers.hall(seconds), (size, size * 4 // 3)
     cameras = cameras_of(WALK, times, seconds, shape, seed)
     phones = [_phone_beside(*place, shape) for place in BESIDE]
     moments = [*range(0, frames, beside)]
-    total, middle = frames + len(phones) * len(moments), middle_of(times)
-    some = cameras[:: max(1, frames // 8)]
+    middle, some = middle_of(times), cameras[:: max(1, frames // 8)]
     tracks = surface_points(world, TRACKS, some, _stream(seed, _TRACKS), middle, world.casts)
     chosen = np.linspace(0, frames, min(frames, MARKED), endpoint=False).astype(int).tolist()
     marks = _marks(world, [times[t] for t in chosen], [cameras[t] for t in chosen], _stream(seed, _KEYS))
 
     def shots() -> Iterator[RigShot]:
-        rays = size * shape[1] * frames * samples_per_pixel
-        processes = workers or max(1, min(cores(), int(rays / SAMPLES_A_PROCESS)))
+        samples = size * shape[1] * frames * samples_per_pixel
         jobs = ((seconds, time, camera, samples_per_pixel) for time, camera in zip(times, cameras))
-        for t, (rgb, distance) in enumerate(by_processes(_whole, jobs, processes)):
-            depth, keypoints = lidar(cameras[t], distance, _stream(seed, _LIDAR, t)), None
-            if t in chosen:
-                keypoints = _keypoints(world, times[t], cameras[t], *marks)
+        for t, (rgb, distance) in enumerate(by_processes(_whole, jobs, samples, workers)):
+            depth = lidar(cameras[t], distance, _stream(seed, _LIDAR, t))
+            keypoints = _keypoints(world, times[t], cameras[t], *marks) if t in chosen else None
             yield RigShot(f"0_{t:05d}", t, 0, "train", cameras[t], rgb, depth=depth, keypoints=keypoints)
-            if progress is not None:
-                progress(t + 1, total)
         of_phones = [[times[t] for t in moments]] * len(phones)
-        images, done = filmed(phones, of_phones, seconds, samples_per_pixel, workers), frames
+        images = movers.filmed(phones, of_phones, seconds, samples_per_pixel, workers)
         for k, phone in enumerate(phones, 1):
-            film, still = Film(next(images)), _seen_by(hall(seconds, has_movers=False), 0.0, phone)
-            counts = views_of(world, times, cameras, *still).reshape(shape[::-1])
+            still = _seen_by(movers.hall(seconds, has_movers=False), 0.0, phone)
+            counts = movers.views_of(world, times, cameras, *still).reshape(shape[::-1])
+            film = movers.Film(next(images))
             for t in moments:
                 rgb, moving = film.add(*next(images))
                 counted = counts.copy()
                 surface = _seen_by(world, times[t], phone, np.flatnonzero(moving))
-                counted[moving] = views_of(world, times, cameras, *surface)
+                counted[moving] = movers.views_of(world, times, cameras, *surface)
                 covisible = counted > max(LEAST_VIEWS, int(LEAST_SHARE * frames))
                 yield RigShot(f"{k}_{t:05d}", t, k, "val", phone, rgb, covisible=covisible)
-                done += 1
-                if progress is not None:
-                    progress(done, total)
 
     low, high, near, far = _space_of(world, times, cameras)
     center, scale = 0.5 * (low + high), 1 / float(np.linalg.norm(high - low))
-    points = still_points(world, some, _stream(seed, _DRAWN), POINTS)
+    points = movers.still_points(world, some, _stream(seed, _DRAWN), POINTS)
     order = [middle, *(time for time in times if time != middle)]
     truth = world.trajectories(*tracks, np.array(order))
     limits = {"center": center.tolist(), "scale": scale, "near": scale * near, "far": scale * far}
     with closing(shots()) as made:
-        hypernerf.write_scene(folder, made, **limits, points=points, trajectories=truth)
-    ids = {0: [*range(frames)]} | {k: moments for k in range(1, len(phones) + 1)}
-    for split, takers in (("train", [0]), ("val", [*ids][1:])):
-        pairs = [(k, t) for k in takers for t in ids[k]]
+        shown = counted(made, frames + len(phones) * len(moments), progress)
+        hypernerf.write_scene(folder, shown, **limits, points=points, trajectories=truth)
+    of_split = {"train": [(0, t) for t in range(frames)]}
+    of_split["val"] = [(k, t) for k in range(1, len(phones) + 1) for t in moments]
+    for split, pairs in of_split.items():
         names = {"frame_names": [f"{k}_{t:05d}" for k, t in pairs]}
         told = names | {"time_ids": [t for _, t in pairs], "camera_ids": [k for k, _ in pairs]}
         write_json(folder / "splits" / f"{split}.json", told)
     box, look = scale * (np.stack([low, high]) - center), scale * (np.array(WALK.focus) - center)
     extra = {"factor": 2, "fps": FPS, "bbox": box.tolist(), "lookat": look.tolist(), "up": UP.tolist()}
     write_json(folder / "extra.json", extra)
-    skeleton = {"name": "unconnected", "parents": [None] * KEYPOINTS}
-    skeleton["kp_names"] = [f"KP_{number}" for number in range(KEYPOINTS)]
+    names = [f"KP_{number}" for number in range(KEYPOINTS)]
+    skeleton = {"name": "unconnected", "parents": [None] * KEYPOINTS, "kp_names": names}
     for factor in (1, 2):
         write_json(folder / "keypoint" / f"{factor}x" / "train" / "skeleton.json", skeleton)
     return folder
@@ -320,14 +276,12 @@ def _stream(*seeds: int) -> np.random.Generator:
 def _phone_beside(azimuth: float, rise: float, shape: tuple[int, int]) -> Camera:
     """Place a phone that stands still, by degrees, which looks at the walk's focus."""
     center = np.array(WALK.focus) + WALK.radius * direction(math.radians(azimuth), math.radians(rise))
-    pose = look_at(torch.from_numpy(center), torch.tensor(WALK.focus), UP)
-    (width, height), focal = shape, 0.5 * shape[0] / math.tan(0.5 * math.radians(WALK.angle))
-    return Camera(width, height, focal, focal, width / 2, height / 2, pose, NEAR, FAR)
+    return pinhole(look_at(center, torch.tensor(WALK.focus), UP), shape, WALK.angle, NEAR, FAR)
 
 
 def _whole(seconds: float, time: float, camera: Camera, samples: int) -> tuple[np.ndarray, np.ndarray]:
     """Do a job: the image (H, W, 3) uint8, and distances (H, W) along the rays."""
-    rgba, distance = render(hall(seconds), time, camera, samples, SHADOW_RAYS)
+    rgba, distance = render(movers.hall(seconds), time, camera, samples, movers.SHADOW_RAYS)
     return rgba[..., :3], distance
 
 
@@ -339,20 +293,18 @@ def _seen_by(world: World, time: float, camera: Camera, pixels: np.ndarray | Non
 
 def _marks(world: World, times, cameras, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """Choose the keypoints among points drawn on the movers: as many of each, those that most images show."""
-    face, barycentric = surface_points(world, CANDIDATES, cameras, rng, times[0], moving_faces(world))
-    counts, part = views_of(world, times, cameras, face, barycentric), world.part_of_face[face]
-    ranked = [
-        rows[np.argsort(-counts[rows], kind="stable")]
-        for rows in (np.flatnonzero(part == one) for one in np.unique(part))
-    ]
+    face, barycentric = surface_points(world, CANDIDATES, cameras, rng, times[0], movers.moving_faces(world))
+    counts, part = movers.views_of(world, times, cameras, face, barycentric), world.part_of_face[face]
+    of_part = [np.flatnonzero(part == one) for one in np.unique(part)]
+    ranked = [rows[np.argsort(-counts[rows], kind="stable")] for rows in of_part]
     best = np.concatenate([rows[: KEYPOINTS // len(ranked)] for rows in ranked])
     return face[best], barycentric[best]
 
 
 def _keypoints(world: World, time: float, camera: Camera, face, barycentric) -> np.ndarray:
     """Project points at a time: rows (J, 3) of x, y and 1, or of zeros where something hides it."""
-    pixel, _ = camera.project(torch.from_numpy(world.points(face, barycentric, time)))
-    seen = views_of(world, [time], [camera], face, barycentric)[:, None]
+    pixel, _ = camera.project(world.points(face, barycentric, time))
+    seen = movers.views_of(world, [time], [camera], face, barycentric)[:, None]
     return np.concatenate([pixel.numpy() * seen, seen], -1)
 
 

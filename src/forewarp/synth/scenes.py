@@ -234,7 +234,7 @@ def orbit_camera(azimuth: float, sine: float, size: int) -> Camera:
     """
     level = math.sqrt(1 - sine * sine)
     direction = np.array([level * math.cos(azimuth), level * math.sin(azimuth), sine])
-    pose = look_at(torch.from_numpy(CAMERA_RADIUS * direction), torch.zeros(3), UP)
+    pose = look_at(CAMERA_RADIUS * direction, torch.zeros(3), UP)
     focal = 0.5 * size / math.tan(0.5 * CAMERA_ANGLE_X)
     return Camera(size, size, focal, focal, size / 2, size / 2, pose, 2.0, 6.0)
 
@@ -330,8 +330,7 @@ def _phone(size: int, k: int, center: np.ndarray, target: np.ndarray) -> Camera:
     (aspect, focal, off, lens), width, height = PHONES[k], size, size * 3 // 4
     fx = focal * 0.5 * width / math.tan(0.5 * math.radians(VIEW_ANGLE))
     cx, cy = width * (0.5 + off[0]), height * (0.5 + off[1])
-    pose = look_at(torch.from_numpy(center), torch.from_numpy(target), UP)
-    return Camera(width, height, fx, fx * aspect, cx, cy, pose, 0.1, 10.0, lens=lens)
+    return Camera(width, height, fx, fx * aspect, cx, cy, look_at(center, target, UP), 0.1, 10.0, lens=lens)
 
 
 def _rig_shots(images: Iterator, cameras: list[Camera]) -> Iterator[hypernerf.RigShot]:
@@ -373,7 +372,7 @@ def _still_points(world: World, pair: tuple[Camera, Camera], rng: np.random.Gene
     still = np.array([part.joint == "ground" for part in world.parts])[world.part_of_face]
     points = world.points(*surface_points(world, STILL_POINTS, list(pair), rng, 0.5, still), 0.5)
     for camera in pair:
-        pixel, depth = (np.asarray(v) for v in camera.project(torch.from_numpy(points)))
+        pixel, depth = (np.asarray(v) for v in camera.project(points))
         inside = (depth > 0) & (pixel > 0).all(-1) & (pixel < (camera.width, camera.height)).all(-1)
         points = points[inside]
     return _in_capture(points).astype(np.float32)

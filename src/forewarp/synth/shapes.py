@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -139,6 +140,11 @@ class Part:
     smooth: bool = False
     casts: bool = True
 
+    def placed(self, maps: Mapping[str, np.ndarray]) -> np.ndarray:
+        """Return where the vertices are (V, 3) by the map (4, 4) of each joint."""
+        place = maps[self.joint]
+        return self.vertices @ place[:3, :3].T + place[:3, 3]
+
 
 def prism(outline, low: float, high: float, axis: int = 2) -> Mesh:
     """Sweep a convex ``outline`` (P, 2), counter-clockwise, along ``axis`` from ``low`` to ``high``.
@@ -147,20 +153,13 @@ def prism(outline, low: float, high: float, axis: int = 2) -> Mesh:
     takes (y, z), axis 1 takes (z, x).
     """
     outline = np.asarray(outline, dtype=np.float64)
-    count = len(outline)
-    vertices = np.empty((2 * count + 2, 3))
-    flat = [(axis + 1) % 3, (axis + 2) % 3]
-    center = outline.mean(0)
-    for start, level in ((0, low), (count + 1, high)):
-        vertices[start : start + count, flat] = outline
-        vertices[start + count, flat] = center
-        vertices[start : start + count + 1, axis] = level
-    i = np.arange(count)
-    j = (i + 1) % count
-    top = count + 1
-    middle = np.full(count, count)
+    flat, count = [(axis + 1) % 3, (axis + 2) % 3], len(outline)
+    top, i, middle = count + 1, np.arange(count), np.full(count, count)
+    vertices, j = np.empty((2, top, 3)), (i + 1) % count
+    vertices[:, :, flat] = np.concatenate([outline, [outline.mean(0)]])
+    vertices[:, :, axis] = [[low], [high]]
     faces = [(i, j, j + top), (i, j + top, i + top), (j, i, middle), (i + top, j + top, middle + top)]
-    return vertices, np.concatenate([np.stack(corners, -1) for corners in faces])
+    return vertices.reshape(-1, 3), np.concatenate([np.stack(corners, -1) for corners in faces])
 
 
 def box(low, high) -> Mesh:
@@ -197,19 +196,18 @@ def sphere(radius: float, rings: int = 24, segments: int = 40) -> Mesh:
     grid = np.stack(axes, -1)
     vertices = np.concatenate([grid.reshape(-1, 3), [[0, 0, -1.0], [0, 0, 1.0]]])
     i = np.arange(segments)
-    j = (i + 1) % segments
+    j, last = (i + 1) % segments, (rings - 2) * segments
     south, north = np.full(segments, len(vertices) - 2), np.full(segments, len(vertices) - 1)
-    faces = [np.stack([j, i, south], -1)]
-    for row in range(rings - 2):
-        a, b = row * segments, (row + 1) * segments
-        faces += [np.stack([a + i, a + j, b + j], -1), np.stack([a + i, b + j, b + i], -1)]
-    last = (rings - 2) * segments
-    faces.append(np.stack([last + i, last + j, north], -1))
-    return radius * vertices, np.concatenate(faces)
+    faces = [(j, i, south)]
+    for a in range(0, last, segments):
+        b = a + segments
+        faces += [(a + i, a + j, b + j), (a + i, b + j, b + i)]
+    faces.append((last + i, last + j, north))
+    return radius * vertices, np.concatenate([np.stack(corners, -1) for corners in faces])
 
 
 def joined(meshes: list[Mesh]) -> Mesh:
     """Join several meshes into one."""
-    offsets = np.cumsum([0] + [len(vertices) for vertices, _ in meshes])
-    faces = [faces + offset for (_, faces), offset in zip(meshes, offsets)]
-    return np.concatenate([vertices for vertices, _ in meshes]), np.concatenate(faces)
+    vertices, faces = zip(*meshes)
+    offsets = np.cumsum([0, *map(len, vertices)])
+    return np.concatenate(vertices), np.concatenate([own + offset for own, offset in zip(faces, offsets)])

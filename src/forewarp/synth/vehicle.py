@@ -6,7 +6,6 @@ The controls are sums of cosines of at most three half periods, which a few low 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
@@ -36,22 +35,6 @@ TYRE = Material("wheel", (CHARCOAL, (0.36, 0.37, 0.40), YELLOW, AMBER), 0.095)
 BEACH = Material("beach", (RED, CREAM, BLUE, YELLOW), BALL_RADIUS)
 
 
-@dataclass(frozen=True)
-class Controls:
-    """Angles in degrees, each relative to the link before it; ``travel``, ``height`` and ``drift`` in world
-    units; ``turn`` in degrees; ``squash`` the ball's height over its diameter.
-    """
-
-    boom: float = 40.0
-    stick: float = -132.0
-    bucket: float = 14.0
-    travel: float = 0.0
-    turn: float = 0.0
-    height: float = 0.0
-    drift: float = 0.0
-    squash: float = 1.0
-
-
 def ease(time: float) -> float:
     """Go from 0 to 1 along half a period of a cosine."""
     return 0.5 - 0.5 * np.cos(np.pi * time)
@@ -59,68 +42,75 @@ def ease(time: float) -> float:
 
 def lift(time: float) -> dict[str, np.ndarray]:
     """Lift the boom; return each joint's map."""
-    return placed(Controls(boom=39 + 42 * ease(time), stick=-112), START)
+    return placed(START, boom=39 + 42 * ease(time), stick=-112)
 
 
 def lift_tilt(time: float) -> dict[str, np.ndarray]:
     """Lift and tilt the whole arm while the ball bounces and drifts; return each joint's map."""
     up, contact = ease(time), 0.5 - 0.5 * np.cos(2 * np.pi * time)
-    controls = Controls(
-        boom=46 + 14 * up,
-        stick=-116 + 26 * up,
-        bucket=10 + 16 * up + 8 * np.sin(np.pi * time) ** 2,
-        height=0.3 * (1 - contact),
-        drift=0.12 * up,
-        squash=1.06 - 0.3 * contact,
-    )
-    return placed(controls, START)
+    arm = {"boom": 46 + 14 * up, "stick": -116 + 26 * up}
+    arm["bucket"] = 10 + 16 * up + 8 * np.sin(np.pi * time) ** 2
+    return placed(START, **arm, height=0.3 * (1 - contact), drift=0.12 * up, squash=1.06 - 0.3 * contact)
 
 
 def drive(time: float) -> dict[str, np.ndarray]:
     """Drive along an arc while the arm moves; return each joint's map."""
     go = ease(time)
     arm = {"boom": 40 + 14 * go, "stick": -132 + 30 * go, "bucket": 14 + 20 * go}
-    return placed(Controls(**arm, travel=0.42 * go, turn=32 * go), DRIVE_START)
+    return placed(DRIVE_START, **arm, travel=0.42 * go, turn=32 * go)
 
 
 def still(time: float) -> dict[str, np.ndarray]:
     """Stand still; return each joint's map."""
-    return placed(Controls(), START)
+    return placed(START)
 
 
 def rigid(time: float) -> dict[str, np.ndarray]:
     """Drive along an arc with the arm fixed; return each joint's map."""
-    return placed(Controls(travel=0.42 * ease(time), turn=32 * ease(time)), DRIVE_START)
+    return placed(DRIVE_START, travel=0.42 * ease(time), turn=32 * ease(time))
 
 
 def quick(time: float) -> dict[str, np.ndarray]:
     """Drive forth and back three times, more than a few cosines can represent; return each joint's map."""
-    return placed(Controls(travel=0.3 * (0.5 - 0.5 * np.cos(6 * np.pi * time))), DRIVE_START)
+    return placed(DRIVE_START, travel=0.3 * (0.5 - 0.5 * np.cos(6 * np.pi * time)))
 
 
 MOTIONS = {"lift": lift, "lift_tilt": lift_tilt, "drive": drive}
 
 
-def placed(controls: Controls, start: tuple[float, float, float]) -> dict[str, np.ndarray]:
+def placed(
+    start: tuple[float, float, float],
+    *,
+    boom: float = 40.0,
+    stick: float = -132.0,
+    bucket: float = 14.0,
+    travel: float = 0.0,
+    turn: float = 0.0,
+    height: float = 0.0,
+    drift: float = 0.0,
+    squash: float = 1.0,
+) -> dict[str, np.ndarray]:
     """Compute each joint's affine map (4, 4) from its rest frame to the world.
 
     Args:
-        controls: angles and lengths.
         start: the chassis's x, y and heading in degrees.
+        boom, stick, bucket: degrees, each relative to the link before it.
+        travel, turn: of the chassis, world units and degrees.
+        height, drift: of the ball, world units.
+        squash: the ball's height over its diameter.
     """
-    chassis = _along_arc(start, controls.travel, controls.turn)
-    boom = chassis @ shift(PIVOT) @ rotation(np.radians(controls.boom), 0, 2)
-    stick = boom @ shift((BOOM, 0, 0)) @ rotation(np.radians(controls.stick), 0, 2)
-    bucket = stick @ shift((STICK, 0, 0)) @ rotation(np.radians(controls.bucket), 0, 2)
-    maps = dict(ground=shift((0, 0, GROUND)), chassis=chassis, boom=boom, stick=stick, bucket=bucket)
-    roll = -np.degrees(controls.travel / WHEEL_RADIUS)
+    chassis = link = _along_arc(start, travel, turn)
+    maps = {"ground": shift((0, 0, GROUND)), "chassis": chassis, "band": chassis @ _band(boom, boom + stick)}
+    joints = (("boom", PIVOT, boom), ("stick", (BOOM, 0, 0), stick), ("bucket", (STICK, 0, 0), bucket))
+    for name, pin, angle in joints:
+        link = maps[name] = link @ shift(pin) @ rotation(np.radians(angle), 0, 2)
+    roll = -np.degrees(travel / WHEEL_RADIUS)
     for name, (x, side, z) in WHEELS.items():
         maps[name] = chassis @ shift((x, side * WHEEL_SIDE, z)) @ rotation(np.radians(roll), 0, 2)
     # The ball is squashed along z and widens across, keeping its volume.
-    wide, (x, y) = controls.squash**-0.5, BALL_AT
-    z = GROUND + 0.002 + BALL_RADIUS * controls.squash + controls.height
-    maps["ball"] = shift((x - controls.drift, y, z)) @ np.diag([wide, wide, controls.squash, 1.0])
-    maps["band"] = chassis @ _band(controls)
+    wide, (x, y) = squash**-0.5, BALL_AT
+    z = GROUND + 0.002 + BALL_RADIUS * squash + height
+    maps["ball"] = shift((x - drift, y, z)) @ np.diag([wide, wide, squash, 1.0])
     return maps
 
 
@@ -131,11 +121,11 @@ def shift(by) -> np.ndarray:
     return place
 
 
-def _band(controls: Controls) -> np.ndarray:
+def _band(boom: float, stick: float) -> np.ndarray:
     """Map a cylinder of length and radius 1 along x to the span between two pins, in the chassis frame;
-    it gets thinner as it stretches, keeping its volume.
+    it gets thinner as it stretches, keeping its volume. Angles of boom and stick are degrees above level.
     """
-    boom, stick = np.radians([controls.boom, controls.boom + controls.stick])
+    boom, stick = np.radians([boom, stick])
     pin = np.array([PIVOT[0], PIVOT[2]]) + BOOM * _direction(boom) + BAND_ALONG_STICK * _direction(stick)
     span = pin - np.array(BAND_FROM)
     length = np.hypot(*span)

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from forewarp.scene.camera import Camera, Lens, look_at
 
@@ -43,17 +44,24 @@ def cameras_of(
     at = _sway(rng, times, seconds, ((0.35, 1.0), (1.1, 0.4), (7.0, 0.04)), 0.012 * walk.radius)
     aim = _sway(rng, times, seconds, ((0.4, 1.0), (1.3, 0.5), (8.0, 0.05)), 0.02 * walk.radius)
     roll = _sway(rng, times, seconds, ((0.5, 1.0), (6.0, 0.1)), 2.0)[:, 0]
-    width, height = size
-    fx = 0.5 * width / math.tan(0.5 * math.radians(walk.angle))
     for time, move, look, turn in zip(times, at, aim, roll):
         azimuth = math.radians(walk.azimuth[0] + (walk.azimuth[1] - walk.azimuth[0]) * time)
         rise = math.radians(walk.height + 4 * math.sin(2 * np.pi * time))
         center = np.array(walk.focus) + walk.radius * direction(azimuth, rise) + move
         aslant = math.sin(math.radians(turn))
         up = torch.tensor([aslant * -math.sin(azimuth), aslant * math.cos(azimuth), 1.0])
-        pose = look_at(torch.from_numpy(center), torch.from_numpy(np.array(walk.focus) + look), up)
-        made.append(Camera(width, height, fx, fx, width / 2, height / 2, pose, NEAR, FAR, lens=walk.lens))
+        pose = look_at(center, np.array(walk.focus) + look, up)
+        made.append(pinhole(pose, size, walk.angle, NEAR, FAR, lens=walk.lens))
     return made
+
+
+def pinhole(
+    pose: Tensor, size: Sequence[int], angle: float, near: float, far: float, *, zoom: float = 1.0, lens=None
+) -> Camera:
+    """Make a camera of ``size`` (width, height), ``angle`` degrees wide; a ``zoom`` above 1 sees less."""
+    width, height = size
+    focal = zoom * 0.5 * width / math.tan(0.5 * math.radians(angle))
+    return Camera(width, height, focal, focal, width / 2, height / 2, pose, near, far, lens=lens)
 
 
 def direction(azimuth: float, rise: float) -> np.ndarray:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 import torch
@@ -200,12 +201,14 @@ class World:
         self.smooth = np.array([p.smooth for p in self.parts])[self.part_of_face]
         self.casts = np.array([p.casts for p in self.parts])[self.part_of_face]
 
+    def __reduce__(self) -> tuple:
+        """Let other processes make it anew, once."""
+        return _world, (self.motion, self.has_room)
+
     def place(self, time: float) -> np.ndarray:
         """Place every vertex at any ``time`` in [0, 1]: world positions (V, 3) float64."""
         maps = self.subject.joints(time)
-        return np.concatenate(
-            [p.vertices @ maps[p.joint][:3, :3].T + maps[p.joint][:3, 3] for p in self.parts]
-        )
+        return np.concatenate([part.placed(maps) for part in self.parts])
 
     def is_there(self, time: float) -> np.ndarray:
         """Tell which faces (F,) are there at ``time``."""
@@ -221,3 +224,8 @@ class World:
         """Follow surface points (N) over ``times`` (T,), the canonical time first; float32 world units."""
         points = np.stack([self.points(faces, barycentric, time) for time in times], 1).astype(np.float32)
         return Truth(torch.from_numpy(points), torch.from_numpy(np.asarray(times, np.float64)))
+
+
+@lru_cache(4)
+def _world(motion: str, has_room: bool) -> World:
+    return World(motion, has_room)
