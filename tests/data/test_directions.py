@@ -5,13 +5,7 @@ import pytest
 import torch
 
 from forewarp.data.cameras import FLIP
-from forewarp.data.directions import (
-    check_directions,
-    inverted,
-    opposite,
-    other_readings,
-    transposed,
-)
+from forewarp.data.directions import check_directions, inverted, opposite, other_readings, transposed
 from forewarp.data.files import SceneError
 from tests.support.written_scenes import around
 

@@ -206,11 +206,7 @@ BAD = {
         (POSES, line(2, lambda w: [w[0] + "0", *w[1:3], *w[:3], *w[6:]]), "line 2: expected a rotation"),
         (POSES, line(4, None), "Intrinsic.inf: expected as many cameras .*got 4 there and 3 in"),
         (".", lambda p: write_dome(p, dome(1), 1), "expected at least 2 cameras, one to"),
-        (
-            ".",
-            lambda p: write_dome(p, dome(2, sizes=((1, 1),)), 1),
-            "at least 2 x 2 pixels to halve",
-        ),
+        (".", lambda p: write_dome(p, dome(2, sizes=((1, 1),)), 1), "at least 2 x 2 pixels to halve"),
         (LENSES, None, "expected a readable file, but got No such file"),
         (
             LENSES,
@@ -254,7 +250,7 @@ LATER = {
         ("train/r_2.png", PIXELS[:4], "r_2.png: expected 8 x 6 pixels, but got 8 x 4"),
     ],
     "dome": [
-        ("img/0/mask/img_0001.jpg", PIXELS[..., 0], "img_0001.jpg: expected 48 x 60 pixels, but got 8 x 6"),
+        ("img/0/mask/img_0001.jpg", PIXELS[..., 0], "img_0001.jpg: expected 48 x 60 pixels, but got 8 x 6")
     ],
     "lego": [
         (DEPTH, b"", "r_0_depth.npy: expected a NumPy file"),

@@ -14,14 +14,7 @@ from forewarp.data.cameras import FLIP
 from forewarp.data.checks import check_seen
 from forewarp.data.files import Entry, SceneError, layout_of
 from forewarp.data.module import DNeRFDataModule
-from forewarp.data.transforms import (
-    camera_of,
-    check_times,
-    left_aside,
-    pose_in,
-    times_of,
-    with_intrinsics,
-)
+from forewarp.data.transforms import camera_of, check_times, left_aside, pose_in, times_of, with_intrinsics
 from tests.support.written_scenes import around, dnerf_shots, edit, write_dnerf
 
 EYE = torch.eye(4, dtype=torch.float64)

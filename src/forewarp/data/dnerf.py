@@ -36,16 +36,7 @@ from forewarp.data.cameras import (
     space_of,
 )
 from forewarp.data.directions import check_directions, common_point
-from forewarp.data.files import (
-    frames_of,
-    mismatch,
-    nearly,
-    number,
-    read_json,
-    remove,
-    scene_folder,
-    whole,
-)
+from forewarp.data.files import frames_of, mismatch, nearly, number, read_json, remove, scene_folder, whole
 from forewarp.data.images import (
     StoredImage,
     alpha_of,
