@@ -121,10 +121,7 @@ def test_confidences_lie_as_depths_do_and_a_depth_is_of_one_image(tmp_path):
     [
         ({"depth": "nowhere"}, "data.depth: expected a folder of depths, but got .*nowhere; set data.depth="),
         ({"depth": "images"}, "images: expected depths|expected a grey PNG of 16 bits"),
-        (
-            {"depth_kind": "deep"},
-            "data.depth_kind: expected one of metric, relative, inverse, but got 'deep'",
-        ),
+        ({"depth_kind": "deep"}, "data.depth_kind: expected metric, relative or inverse, but got 'deep'"),
         (
             {"depth": "some", "depth_kind": "inverse"},
             "data.depth_kind: expected points that never move, to fit",

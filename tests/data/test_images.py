@@ -149,7 +149,7 @@ def test_the_foreground_is_cut_out_and_only_it_is_kept(cut_out):
 
 
 def test_halves_cut_off_an_odd_row_and_mix_in_no_studio(cut_out):
-    rgba = cut_out(halve=True)()
+    rgba = cut_out(factor=2)()
     assert rgba.shape == (15, 20, 4)
     assert rgba[4:10, 3:15, 3].eq(255).all()
     assert rgba[4:10, 2, 3].eq(128).all()  # columns 4 and 5, of which one is foreground

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from forewarp.data.files import mismatch
+from forewarp.data.files import mismatch, number
 from forewarp.scene.box import Box
 from forewarp.scene.camera import Camera, Lens, focus_point
 
@@ -69,6 +69,11 @@ def pose_of(value: object, where: str) -> np.ndarray:
 def opengl_rows(pose: np.ndarray | torch.Tensor, where: str) -> list[list[float]]:
     """Make the ``transform_matrix`` of a pose (4, 4) with OpenCV's axes, to be written."""
     return (pose_of(np.asarray(pose, np.float64), where) @ FLIP).tolist()
+
+
+def length_of(value: object, where: str) -> float | None:
+    """Check a length in world units that may be unknown, None."""
+    return None if value is None else number(value, where, 0, MOST_UNITS)
 
 
 def box_of(values: Sequence[float]) -> Box:
@@ -162,9 +167,13 @@ class Normalisation:
 
     def points(self, points: np.ndarray | torch.Tensor) -> torch.Tensor:
         """Move points (..., 3) from the file's world to the scene's: float64."""
-        return (
-            torch.as_tensor(points).double() - torch.tensor(self.center, dtype=torch.float64)
-        ) * self.scale
+        center = torch.tensor(self.center, dtype=torch.float64)
+        return (torch.as_tensor(points).double() - center) * self.scale
+
+    @property
+    def told(self) -> dict:
+        """What a scene's protocol says of it."""
+        return {"center": list(self.center), "scale": self.scale}
 
     def camera(self, camera: Camera) -> Camera:
         """Move a camera from the file's world to the scene's."""

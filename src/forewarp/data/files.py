@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import glob
 import hashlib
+import json
 import operator
 import os
 import re
@@ -35,19 +36,8 @@ LAYOUTS = {  # what people call a layout: a file or folder that tells it, and wh
     "COLMAP": ("sparse", "forewarp-capture images=<its images> colmap=<its sparse/0>"),
     "DyNeRF": ("poses_bounds.npy", "experiment=multicam"),
 }
-UNREAD = {
-    ".webp",
-    ".tif",
-    ".tiff",
-    ".heic",
-    ".heif",
-    ".avif",
-    ".bmp",
-    ".gif",
-    ".jxl",
-    ".jp2",
-    ".exr",
-}  # of images
+# Suffixes of images that are not read.
+UNREAD = {".webp", ".tif", ".tiff", ".heic", ".heif", ".avif", ".bmp", ".gif", ".jxl", ".jp2", ".exr"}
 RECORD = "synthesis.json"  # of every synthesised scene, or folder of them
 LOCK = ".lock"  # of every folder of a run
 _UNPRINTABLE = {"Cc", "Cs", "Zl", "Zp"}  # control characters, surrogates, line and paragraph separators
@@ -139,6 +129,18 @@ def number(value: object, where: str, low: float = -inf, high: float = inf) -> f
     return float(value)
 
 
+def one_of(value: object, where: str, *allowed: object, advice: str = "") -> None:
+    """Refuse a value that is none of those ``allowed``; ``where`` names the key.
+
+    >>> one_of("yes", "data.half", True, False, "auto")
+    Traceback (most recent call last):
+    forewarp.data.files.SceneError: data.half: expected true, false or auto, but got 'yes'
+    """
+    if value not in allowed:
+        *texts, last = (json.dumps(each).strip('"') for each in allowed)  # as YAML writes them
+        raise mismatch(where, f"{', '.join(texts)} or {last}", short(value), advice)
+
+
 def whole(value: object, where: str, least: int, multiple: int = 1) -> int:
     """Check a whole number of at least ``least`` that ``multiple`` divides; ``where`` names the key to set.
 
@@ -211,9 +213,7 @@ class Entry:
         """Check a number as ``number`` does."""
         return number(self.get(key, default), self.where(key), low, high)
 
-    def numbers(
-        self, key: str, count: int, low: float = -inf, high: float = inf, default=None
-    ) -> list[float]:
+    def numbers(self, key: str, count: int, low=-inf, high=inf, default=None) -> list[float]:
         """Check a list of ``count`` numbers."""
         values, where = self.get(key, default), self.where(key)
         if not isinstance(values, list) or len(values) != count:

@@ -46,8 +46,8 @@ from forewarp.data.images import (
     StoredImage,
     StoredMask,
     check_pixels,
+    exif_turned,
     inspect_image,
-    turned_by_exif,
     write_image,
 )
 from forewarp.data.transforms import check_pinhole, check_times, numbers_in, with_images, with_suffix
@@ -206,7 +206,7 @@ def read_scene(
         protocol["depth"] = f"{depth}, of {len(depths)} of {len(train)} training frames"
     if any(f.load_valid for f in train):
         protocol["masks"] = "ignore: pixels of alpha 0 are not trained or measured on"
-    assumed += turned_by_exif(turned, images)
+    assumed += exif_turned(turned, images)
     if ways := other_readings(list(stored.values()), _READINGS):
         line = "cameras do not look at one thing, as all of them do if"
         assumed.append(f"{folder / 'camera'}: {line} {', or if '.join(ways)}; if so, write them anew")

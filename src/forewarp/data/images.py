@@ -21,7 +21,7 @@ from PIL import Image, ImageOps, UnidentifiedImageError
 from torch import Tensor
 
 from forewarp.clock import left_out
-from forewarp.data.files import mismatch, number, opened
+from forewarp.data.files import mismatch, number, one_of, opened
 from forewarp.files import MOST_IMAGE, written_whole
 from forewarp.ops.grid import block_means, block_sums
 from forewarp.scene.frame import spread
@@ -155,7 +155,7 @@ def inspect_image(path: Path, size: tuple[int, int] | None = None, why: str = ""
     return header
 
 
-def turned_by_exif(paths: Sequence[Path], where: object) -> list[str]:
+def exif_turned(paths: Sequence[Path], where: object) -> list[str]:
     """Say in a line that images were read as stored, although their EXIF orientation turns them.
 
     Args:
@@ -302,8 +302,7 @@ def alpha_of(alpha: str | None, paths: Sequence[Path], where: object) -> tuple[b
     Raises:
         SceneError: for another value.
     """
-    if alpha not in (None, "straight", "premultiplied"):
-        raise mismatch("data.alpha", "straight, premultiplied or null", repr(alpha))
+    one_of(alpha, "data.alpha", "straight", "premultiplied", None)
     if alpha is not None or not paths:
         return alpha == "premultiplied", []
     if not is_premultiplied(read_image(paths[i]) for i in spread(len(paths), _EDGES_OF)):
@@ -328,7 +327,8 @@ class StoredImage:
     Args:
         path: of the image.
         size: (width, height), what the files must hold.
-        halve: average 2 x 2 pixels; of a cut-out an odd last row or column is cut off.
+        factor: average blocks of so many pixels a side; of a cut-out, at most 2, an odd last row or column is
+            cut off.
         mask: of the same size; what is foreground see ``bright``.
         opaque: leave the image's own alpha aside.
         premultiplied: colours on disk are multiplied by alpha.
@@ -338,12 +338,12 @@ class StoredImage:
         self,
         path: Path,
         size: tuple[int, int],
-        halve: bool = False,
+        factor: int = 1,
         mask: Path | None = None,
         opaque: bool = False,
         premultiplied: bool = False,
     ) -> None:
-        self.path, self.size, self.halve, self.mask = path, size, halve, mask
+        self.path, self.size, self.factor, self.mask = path, size, factor, mask
         self.opaque, self.premultiplied = opaque, premultiplied
         self._corner = (0, 0)
 
@@ -353,7 +353,7 @@ class StoredImage:
         if self.mask is None:
             return part
         (row, column), (rows, columns) = self._corner, part.shape[:2]
-        width, height = (n // 2 if self.halve else n for n in self.size)
+        width, height = (n // self.factor for n in self.size)
         whole = torch.zeros(height, width, 4, dtype=torch.uint8)
         whole[row : row + rows, column : column + columns] = part
         return whole
@@ -366,9 +366,9 @@ class StoredImage:
         if self.opaque:
             rgba[..., 3] = 255
         if self.mask is None:
-            return reduced(rgba) if self.halve else rgba
+            return rgba if self.factor == 1 else reduced(rgba, self.factor)
         rgba *= (bright(self.mask, self.size) & (rgba[..., 3] > 0))[..., None]
-        rgba = halved_cutout(rgba) if self.halve else rgba
+        rgba = rgba if self.factor == 1 else halved_cutout(rgba)
         foreground = rgba[..., 3] > 0
         if not bool(foreground.any()):
             return rgba[:0, :0].clone()

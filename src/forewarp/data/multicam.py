@@ -22,21 +22,11 @@ import torch
 from torch import Tensor
 
 from forewarp.data.arrays import load_numpy
-from forewarp.data.cameras import MOST_UNITS, box_of, pose_of, space_of
+from forewarp.data.cameras import MOST_UNITS, box_of, length_of, pose_of, space_of
 from forewarp.data.directions import inverted, other_readings
-from forewarp.data.files import mismatch, number, scene_folder, whole
+from forewarp.data.files import mismatch, number, one_of, scene_folder, whole
 from forewarp.data.films import STORE, Film
-from forewarp.data.images import (
-    CACHE,
-    SUFFIXES,
-    TURN,
-    StoredImage,
-    by,
-    in_order,
-    inspect_image,
-    reduced,
-    turned_by_exif,
-)
+from forewarp.data.images import CACHE, SUFFIXES, TURN, StoredImage, by, exif_turned, in_order, inspect_image
 from forewarp.data.rigs import held_cameras, held_moments, split_rig
 from forewarp.data.video import VIDEOS, extracted, stamps_of
 from forewarp.files import written_whole
@@ -88,17 +78,6 @@ class _Track:
         return f"{self.path.stem}/{self.images[moment].stem if self.images else f'{moment:04d}'}"
 
 
-class ReducedImage(StoredImage):
-    """An opaque image whose blocks of ``factor`` x ``factor`` pixels are averaged."""
-
-    def __init__(self, path: Path, size: tuple[int, int], factor: int) -> None:
-        super().__init__(path, size, opaque=True)
-        self.factor = factor
-
-    def _decode(self) -> Tensor:
-        return reduced(super()._decode(), self.factor)
-
-
 def read_scene(
     root: str | Path,
     scene: str,
@@ -132,37 +111,36 @@ def read_scene(
     Cost: a pass over each video that decodes its first frame alone; a small read of each image.
     """
     folder = scene_folder(root, scene, "multicam")
-    if not isinstance(normalise, bool):
-        raise mismatch("data.normalise", "true or false", repr(normalise))
+    one_of(normalise, "data.normalise", True, False)
     scale, every = whole(scale, "data.scale", 1), whole(test_every, "data.test_every", 1)
     paths = _paths(folder)
     rows = _read_rows(folder / FILE, list(paths))
     tracks = [_look(path) for path in paths.values()]
     count, assumed = _moments(tracks, None if frames is None else whole(frames, "data.frames", 1), folder)
     turned = [path for track in tracks for path in track.images[:count] if path in track.turned]
-    assumed += turned_by_exif(turned, folder)
+    assumed += exif_turned(turned, folder)
     held, moments = held_cameras(test_cameras, list(paths), [0]), held_moments(test_moments, count)
     factors = [_factor(track, row, scale) for track, row in zip(tracks, rows)]
     cameras = [_camera(row, scale) for row in rows]
     bytes_of_all = 4 * count * sum(camera.width * camera.height for camera in cameras)
     films = [track.path.name for track in tracks if track.stamps is not None]
     if films and bytes_of_all > CACHE.limit and STORE.limit == 0:
-        line = (
-            f"all frames take {bytes_of_all / 1e9:.3g} GB, more than data.cache_bytes: each is sought in its"
-        )
+        line = f"all frames take {bytes_of_all / 1e9:.3g} GB, more than data.cache_bytes: each is sought in"
         stem = films[0].rsplit(".", 1)[0]
         advice = f"faster are folders of frames, mkdir {stem}; ffmpeg -i {films[0]} {stem}/%04d.png"
-        assumed.append(f"{folder}: {line} film, which takes seconds; {advice}")
+        assumed.append(f"{folder}: {line} its film, which takes seconds; {advice}")
     loads = []
     for track, camera, factor in zip(tracks, cameras, factors):
         if track.stamps is None:
-            loads.append([ReducedImage(path, track.size, factor) for path in track.images[:count]])
+            images = track.images[:count]
+            loads.append([StoredImage(path, track.size, factor, opaque=True) for path in images])
         else:
             size = (camera.width, camera.height)
             loads.append(Film(track.path, track.stamps[:count], size, bytes_of_all).images)
     aslant = max(math.hypot(1, math.hypot(c.width / c.fx, c.height / c.fy) / 2) for c in cameras)
-    near = min(row.near for row in rows) if near is None else number(near, "data.near", 0, MOST_UNITS)
-    far = aslant * max(row.far for row in rows) if far is None else number(far, "data.far", 0, MOST_UNITS)
+    near, far = length_of(near, "data.near"), length_of(far, "data.far")
+    near = min(row.near for row in rows) if near is None else near
+    far = aslant * max(row.far for row in rows) if far is None else far
     given = None if box is None else box_of(box)
     space, seen = space_of(cameras, str(folder / FILE), near=near, far=far, box=given, normalise=normalise)
     cameras = [space.camera(camera) for camera in cameras]
@@ -183,7 +161,7 @@ def read_scene(
         "test_cameras": [list(paths)[k] for k in held],
         "test_moments": sorted(moments),
         "test_frames": len(test),
-        "normalisation": {"center": list(space.center), "scale": space.scale},
+        "normalisation": space.told,
         "near": space.near,
         "far": space.far,
     }
@@ -260,11 +238,7 @@ def _read_rows(path: Path, names: Sequence[str]) -> list[_Row]:
         if any(side % 1 for side in sizes):
             raise mismatch(f"{where}: height and width", "whole numbers", f"{height:g} and {width:g}")
         focal = number(focal, f"{where}: focal length", 0.01 * width, 100 * width)
-        if (
-            not 0
-            < number(near, f"{where}: near", 0, MOST_UNITS)
-            < number(far, f"{where}: far", 0, MOST_UNITS)
-        ):
+        if not 0 < near < number(far, f"{where}: bounds", 0, MOST_UNITS):
             raise mismatch(f"{where}: bounds", "0 < near < far", f"{near:g} and {far:g}")
         rows.append(_Row(pose, (int(width), int(height)), focal, near, far))
     if ways := other_readings([row.pose for row in rows], _READINGS):
@@ -328,9 +302,8 @@ def _factor(track: _Track, row: _Row, scale: int) -> int:
     """Return by how much a camera's frames are to be reduced."""
     if any(side % scale for side in row.size):
         raise mismatch("data.scale", f"a divisor of both sides of {by(row.size)} pixels", scale)
-    fitting = {
-        tuple(side // n for side in row.size): scale // n for n in range(1, scale + 1) if scale % n == 0
-    }
+    divisors = [n for n in range(1, scale + 1) if scale % n == 0]
+    fitting = {tuple(side // n for side in row.size): scale // n for n in divisors}
     if track.size not in fitting:
         smaller = row.size[0] // track.size[0]
         is_smaller = smaller > 1 and tuple(side // smaller for side in row.size) == track.size

@@ -20,8 +20,8 @@ import torch
 from forewarp.data.arrays import read_cloud, read_truth, shortened, write_array, write_truth
 from forewarp.data.cameras import box_of, check_middle, pose_of
 from forewarp.data.directions import inverted, opposite, other_readings
-from forewarp.data.files import SceneError, mismatch, numbers_of, opened, remove, scene_folder, whole
-from forewarp.data.images import StoredImage, by, check_pixels, inspect_image, turned_by_exif, write_image
+from forewarp.data.files import SceneError, mismatch, numbers_of, one_of, opened, remove, scene_folder, whole
+from forewarp.data.images import StoredImage, by, check_pixels, exif_turned, inspect_image, write_image
 from forewarp.data.rigs import held_cameras, held_moments, split_rig
 from forewarp.files import decoded, replace_file
 from forewarp.scene.box import Box
@@ -77,8 +77,7 @@ def read_scene(
     Cost: two small reads an image and one of every point.
     """
     folder = scene_folder(root, scene, "nhr")
-    if not isinstance(half_resolution, bool):
-        raise mismatch("data.half_resolution", "true or false", repr(half_resolution))
+    one_of(half_resolution, "data.half_resolution", True, False)
     poses, matrices = _read_poses(folder / "CamPose.inf"), _read_intrinsics(folder / "Intrinsic.inf")
     if len(poses) != len(matrices):
         got = f"{len(matrices)} there and {len(poses)} in CamPose.inf"
@@ -109,7 +108,7 @@ def read_scene(
 
     def view(f: int, k: int) -> Frame:
         place, name = places[f], names[k]
-        load = StoredImage(place / name, sizes[k], half_resolution, place / "mask" / name)
+        load = StoredImage(place / name, sizes[k], 1 + half_resolution, place / "mask" / name)
         time = (numbers[f] - numbers[0]) / span
         return Frame(f"{place.name}/{Path(name).stem}", time, cameras[k], load, camera_id=k)
 
@@ -131,7 +130,7 @@ def read_scene(
     if on_disk[0] != 0 or first != 0 or on_disk[-1] - on_disk[0] >= len(on_disk):
         said = f"frames {on_disk[0]} to {on_disk[-1]} ({len(on_disk)}) and cameras from {first}"
         assumed = [f"{folder / 'img'}: {said} taken in order, times by their numbers", *assumed]
-    if assumed := [*assumed, *turned_by_exif(turned, folder / "img")]:
+    if assumed := [*assumed, *exif_turned(turned, folder / "img")]:
         protocol["assumed"] = assumed
     truth = read_truth(folder / "trajectories.npz", 0.0)
     if truth is not None and moments < len(places):  # the file's times are those of all frames on disk
