@@ -308,7 +308,9 @@ def test_splits_take_the_place_of_the_lists(tmp_path):
     ):
         read_scene(tmp_path, "toy")
     edit(folder / "splits" / "val.json", {"frame_names.0": "none"})
-    with pytest.raises(SceneError, match="val.json: frame_names: expected items of dataset.json, but got"):
+    with pytest.raises(
+        SceneError, match="val.json: frame_names: expected items of dataset.json's ids, but got"
+    ):
         read_scene(tmp_path, "toy")
 
 

@@ -225,7 +225,7 @@ def _read_records(
             if count > 1:
                 raise mismatch(f"{folder}: {split}", "each image once", f"{path.name} twice", "remove one")
         poses = [record.camera.camera_to_world for record in records[split]]
-        advice, other = None, next((s for s in agree if s != split), None)
+        advice, other = "", next((s for s in agree if s != split), None)
         if other or split != "train":
             wanted = f"as in transforms_{other}.json" if other else "all in OpenGL's axes (docs/own-data.md)"
             advice = f"write them {wanted}, or set data.axes=opengl if they are right"

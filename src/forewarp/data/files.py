@@ -97,9 +97,9 @@ def nearly(path: Path) -> str:
     return f"{path.parent.name}/{there[0]} is there{advice}"
 
 
-def read_bytes(path: Path, most: int = MOST_BYTES) -> bytes:
+def read_bytes(path: Path, most: int = MOST_BYTES, what: str = "a readable file") -> bytes:
     """Read a file; SceneError as ``opened``."""
-    with opened(path, most) as stream:
+    with opened(path, most, what) as stream:
         return stream.read()
 
 

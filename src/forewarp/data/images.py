@@ -10,6 +10,7 @@ import warnings
 import weakref
 from collections import OrderedDict
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from datetime import datetime, timezone
 from pathlib import Path
@@ -21,7 +22,7 @@ from PIL import Image, ImageOps, UnidentifiedImageError
 from torch import Tensor
 
 from forewarp.clock import left_out
-from forewarp.data.files import mismatch, number, one_of, opened
+from forewarp.data.files import mismatch, number, one_of, opened, read_bytes
 from forewarp.files import MOST_IMAGE, written_whole
 from forewarp.ops.grid import block_means, block_sums
 from forewarp.scene.frame import spread
@@ -448,8 +449,7 @@ def hides_image(rgba: Tensor) -> bool:
 
 def _decode(path: Path, mode: str, upright: bool = False) -> np.ndarray:
     """Decode the first image of a file in one of Pillow's modes, turned upright if wanted."""
-    with opened(path, MOST_IMAGE, "an image") as stream:
-        content = io.BytesIO(stream.read())
+    content = io.BytesIO(read_bytes(path, MOST_IMAGE, "an image"))
     _inspect(content, path, mode)
     content.seek(0)
     try:
@@ -484,11 +484,12 @@ def _inspect(stream: BinaryIO, path: Path, mode: str = "RGBA") -> Header:
     if mode == "RGBA" and (has_16_bits or image.mode == "CMYK"):
         got = "16 bits" if has_16_bits else "CMYK"
         raise mismatch(path, "8 bits a channel, grey or RGB", got, "convert the image")
-    header = Header(image.size, image.has_transparency_data, _is_turned(image))
-    try:
+    is_turned = False
+    with suppress(Exception):  # a harmed tag, of what no pixel depends on; of a PNG asking would decode it
+        is_turned = image.format == "JPEG" and image.getexif().get(_ORIENTATION, 1) not in (0, 1)
+    header, is_whole = Header(image.size, image.has_transparency_data, is_turned), False
+    with suppress(Exception):  # OSError, SyntaxError and more
         is_whole = image.verify() is None if image.format == "PNG" else _has_jpeg_end(stream)
-    except Exception:  # OSError, SyntaxError and more
-        is_whole = False
     if not is_whole:
         raise mismatch(path, "a whole image", "a truncated or harmed one", "copy the file again")
     return header
@@ -504,14 +505,6 @@ def _kind_of(stream: BinaryIO) -> tuple[str, str]:
         if head[at:].startswith(marks):
             return kind, "convert it to PNG or JPEG"
     return "another kind of file or a harmed header" if head else "an empty file", ""
-
-
-def _is_turned(image: Image.Image) -> bool:
-    """Tell whether a JPEG's EXIF orientation turns it; of a PNG asking would decode it."""
-    try:
-        return image.format == "JPEG" and image.getexif().get(_ORIENTATION, 1) not in (0, 1)
-    except Exception:  # a harmed tag, of what no pixel depends on
-        return False
 
 
 def _has_jpeg_end(stream: BinaryIO) -> bool:
