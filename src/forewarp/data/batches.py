@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from torch.utils.data import IterableDataset
 
-from forewarp.data.files import mismatch
+from forewarp.data.files import mismatch, one_of
 from forewarp.data.images import StoredImage, composited, reduced
 from forewarp.ops.grid import block_means, reduced_depth
 from forewarp.scene.frame import Frame, Scene, instants_of
@@ -20,8 +20,7 @@ COLORS = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}
 
 def color_of(background: str) -> Tensor:
     """Look up the background colour (3,) white or black."""
-    if background not in COLORS:
-        raise mismatch("data.eval_background", "white or black", repr(background))
+    one_of(background, "data.eval_background", *COLORS)
     return torch.tensor(COLORS[background])
 
 
@@ -66,8 +65,7 @@ class Sampler(IterableDataset):
     ) -> None:
         if rays is not None and int(rays) < 1:
             raise mismatch("data.rays", "at least 1", rays)
-        if background not in (*COLORS, "random"):
-            raise mismatch("data.background", "white, black or random", repr(background))
+        one_of(background, "data.background", *COLORS, "random")
         if int(views_per_step) < 1:
             raise mismatch("data.views_per_step", "at least 1", views_per_step)
         self.frames, self.background, self.picker, self.asks = scene.train, background, picker, asks or Asks()

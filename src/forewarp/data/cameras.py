@@ -145,6 +145,16 @@ def _can_be_undone(*inner: float | Lens) -> bool:
     return bool(((again - torch.stack([u, v], -1)).abs() < _SAME_PIXEL).all())
 
 
+def smaller(camera: Camera, scale: int) -> Camera:
+    """Scale a camera to an image whose sides are ``scale`` times smaller; sizes are rounded, all else exact.
+
+    The skew shrinks too. Public loaders leave it as it is, which slants the image wherever it is not 0.
+    """
+    size = {"width": round(camera.width / scale), "height": round(camera.height / scale)}
+    pixels = {key: getattr(camera, key) / scale for key in ("fx", "fy", "cx", "cy", "skew")}
+    return replace(camera, **size, **pixels)
+
+
 def nine_pixels(camera: Camera) -> torch.Tensor:
     """Flat indices (9,) of the corners, the middles of the edges and the centre."""
     columns = torch.tensor([0, camera.width // 2, camera.width - 1])

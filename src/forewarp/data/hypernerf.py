@@ -37,6 +37,7 @@ from forewarp.data.cameras import (
     check_middle,
     frustum_box,
     pose_of,
+    smaller,
 )
 from forewarp.data.depth import SensedDepth, depths_beside, unit_of
 from forewarp.data.directions import by_translation, opposite, other_readings, transposed
@@ -156,7 +157,7 @@ def read_scene(
         path = paths[item]
         camera = read_camera(inside(folder / "camera", f"{item}.json", where), near, far)
         poses.append(camera.camera_to_world)
-        camera = reduced(normalised.camera(camera), scale)
+        camera = smaller(normalised.camera(camera), scale)
         size = camera.width, camera.height
         header, options = inspect_image(path, size, f", the camera's image_size / {scale}"), {}
         if header.is_turned:
@@ -316,16 +317,6 @@ def write_camera(path: Path, camera: Camera) -> None:
         "image_size": [camera.width, camera.height],
     }
     write_json(path, content)
-
-
-def reduced(camera: Camera, scale: int) -> Camera:
-    """Scale a camera to an image whose sides are ``scale`` times smaller; sizes are rounded, all else exact.
-
-    The skew shrinks too. Public loaders leave it as it is, which slants the image wherever it is not 0.
-    """
-    size = {"width": round(camera.width / scale), "height": round(camera.height / scale)}
-    pixels = {key: getattr(camera, key) / scale for key in ("fx", "fy", "cx", "cy", "skew")}
-    return replace(camera, **size, **pixels)
 
 
 def _read_split(path: Path) -> tuple[str, list[str], list[str], list[str]]:

@@ -19,10 +19,9 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from forewarp.data.arrays import load_numpy
-from forewarp.data.cameras import MOST_UNITS, box_of, length_of, pose_of, space_of
+from forewarp.data.cameras import MOST_UNITS, box_of, length_of, pose_of, smaller, space_of
 from forewarp.data.directions import inverted, other_readings
 from forewarp.data.files import mismatch, number, one_of, scene_folder, whole
 from forewarp.data.films import STORE, Film
@@ -41,19 +40,6 @@ _READINGS = {  # what else may be in a row
     "they are world-to-camera": lambda poses: inverted(poses @ _AXES) @ _AXES,
     "the axes are OpenCV's": lambda poses: poses @ _AXES,
 }
-
-
-@dataclass(frozen=True)
-class _Row:
-    """A row of the file: ``pose`` (4, 4) with OpenCV's axes, ``size`` (width, height), focal length in
-    pixels, and the depths of the nearest and the farthest matter.
-    """
-
-    pose: Tensor
-    size: tuple[int, int]
-    focal: float
-    near: float
-    far: float
 
 
 @dataclass(frozen=True)
@@ -114,14 +100,14 @@ def read_scene(
     one_of(normalise, "data.normalise", True, False)
     scale, every = whole(scale, "data.scale", 1), whole(test_every, "data.test_every", 1)
     paths = _paths(folder)
-    rows = _read_rows(folder / FILE, list(paths))
+    whole_cameras = _read_rows(folder / FILE, list(paths))
     tracks = [_look(path) for path in paths.values()]
     count, assumed = _moments(tracks, None if frames is None else whole(frames, "data.frames", 1), folder)
     turned = [path for track in tracks for path in track.images[:count] if path in track.turned]
     assumed += exif_turned(turned, folder)
     held, moments = held_cameras(test_cameras, list(paths), [0]), held_moments(test_moments, count)
-    factors = [_factor(track, row, scale) for track, row in zip(tracks, rows)]
-    cameras = [_camera(row, scale) for row in rows]
+    factors = [_factor(track, camera, scale) for track, camera in zip(tracks, whole_cameras)]
+    cameras = [smaller(camera, scale) for camera in whole_cameras]
     bytes_of_all = 4 * count * sum(camera.width * camera.height for camera in cameras)
     films = [track.path.name for track in tracks if track.stamps is not None]
     if films and bytes_of_all > CACHE.limit and STORE.limit == 0:
@@ -139,8 +125,8 @@ def read_scene(
             loads.append(Film(track.path, track.stamps[:count], size, bytes_of_all).images)
     aslant = max(math.hypot(1, math.hypot(c.width / c.fx, c.height / c.fy) / 2) for c in cameras)
     near, far = length_of(near, "data.near"), length_of(far, "data.far")
-    near = min(row.near for row in rows) if near is None else near
-    far = aslant * max(row.far for row in rows) if far is None else far
+    near = min(camera.near for camera in cameras) if near is None else near
+    far = aslant * max(camera.far for camera in cameras) if far is None else far
     given = None if box is None else box_of(box)
     space, seen = space_of(cameras, str(folder / FILE), near=near, far=far, box=given, normalise=normalise)
     cameras = [space.camera(camera) for camera in cameras]
@@ -214,8 +200,8 @@ def _images(folder: Path) -> list[Path]:
     return in_order((path for path in there if path.suffix in SUFFIXES), lambda path: path.name)
 
 
-def _read_rows(path: Path, names: Sequence[str]) -> list[_Row]:
-    """Read and check a row for each camera.
+def _read_rows(path: Path, names: Sequence[str]) -> list[Camera]:
+    """Read the cameras of whole images, their near and far the depths of the nearest and the farthest matter.
 
     Raises:
         SceneError: naming the row, or saying in which other way poses seem to be written.
@@ -228,7 +214,7 @@ def _read_rows(path: Path, names: Sequence[str]) -> list[_Row]:
         expected = f"a row for each of {len(names)} cameras, {names[0]} to {names[-1]}"
         advice = "remove the row or the camera that the other lacks"
         raise mismatch(path, expected, f"{len(array)} rows", advice)
-    rows = []
+    cameras = []
     for k, (name, values) in enumerate(zip(names, np.array(array, np.float64))):
         where = f"{path}: row {k} ({name})"
         block, (near, far) = values[:15].reshape(3, 5), values[15:].tolist()
@@ -240,12 +226,13 @@ def _read_rows(path: Path, names: Sequence[str]) -> list[_Row]:
         focal = number(focal, f"{where}: focal length", 0.01 * width, 100 * width)
         if not 0 < near < number(far, f"{where}: bounds", 0, MOST_UNITS):
             raise mismatch(f"{where}: bounds", "0 < near < far", f"{near:g} and {far:g}")
-        rows.append(_Row(pose, (int(width), int(height)), focal, near, far))
-    if ways := other_readings([row.pose for row in rows], _READINGS):
+        middle = width / 2, height / 2
+        cameras.append(Camera(int(width), int(height), focal, focal, *middle, pose, near, far))
+    if ways := other_readings([camera.camera_to_world for camera in cameras], _READINGS):
         expected = "[R | T] camera-to-world with the axes down, right, backwards"
         got = f"cameras that look at one thing only if {', or if '.join(ways)}"
         raise mismatch(path, expected, got, "convert them")
-    return rows
+    return cameras
 
 
 def _look(path: Path) -> _Track:
@@ -298,24 +285,18 @@ def _moments(tracks: Sequence[_Track], most: int | None, folder: Path) -> tuple[
     return count, assumed
 
 
-def _factor(track: _Track, row: _Row, scale: int) -> int:
-    """Return by how much a camera's frames are to be reduced."""
-    if any(side % scale for side in row.size):
-        raise mismatch("data.scale", f"a divisor of both sides of {by(row.size)} pixels", scale)
+def _factor(track: _Track, camera: Camera, scale: int) -> int:
+    """Return by how much frames are to be reduced, of which ``camera`` is that of whole ones."""
+    whole = camera.width, camera.height
+    if any(side % scale for side in whole):
+        raise mismatch("data.scale", f"a divisor of both sides of {by(whole)} pixels", scale)
     divisors = [n for n in range(1, scale + 1) if scale % n == 0]
-    fitting = {tuple(side // n for side in row.size): scale // n for n in divisors}
+    fitting = {tuple(side // n for side in whole): scale // n for n in divisors}
     if track.size not in fitting:
-        smaller = row.size[0] // track.size[0]
-        is_smaller = smaller > 1 and tuple(side // smaller for side in row.size) == track.size
+        smaller = camera.width // track.size[0]
+        is_smaller = smaller > 1 and tuple(side // smaller for side in whole) == track.size
         advice = f"set data.scale={smaller}" if is_smaller else ""
         advice = TURN if track.size[::-1] in fitting else advice
         expected = f"{' or '.join(map(by, fitting))} pixels as {FILE} and data.scale={scale} say"
         raise mismatch(track.path, expected, by(track.size), advice)
     return fitting[track.size]
-
-
-def _camera(row: _Row, scale: int) -> Camera:
-    """Make the camera of images reduced by ``scale``, its near and far 0."""
-    width, height = (side // scale for side in row.size)
-    focal = row.focal / scale
-    return Camera(width, height, focal, focal, width / 2, height / 2, row.pose, 0.0, 0.0)
