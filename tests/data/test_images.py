@@ -128,11 +128,10 @@ def cut_out(tmp_path):
     image = np.broadcast_to(np.array(STUDIO, np.uint8), (31, 40, 3)).copy()
     mask = np.zeros((31, 40), np.uint8)
     image[8:21, 5:31], mask[8:21, 5:31] = SKIN, 255
-    write_image(tmp_path / "image.jpg", image, quality=100)
-    write_image(tmp_path / "mask.jpg", mask)
-    return lambda **options: StoredImage(
-        tmp_path / "image.jpg", (40, 31), mask=tmp_path / "mask.jpg", **options
-    )
+    paths = tmp_path / "image.jpg", tmp_path / "mask.jpg"
+    Image.fromarray(image).save(paths[0], quality=100, subsampling=0)
+    write_image(paths[1], mask)
+    return lambda **options: StoredImage(paths[0], (40, 31), mask=paths[1], **options)
 
 
 def test_the_foreground_is_cut_out_and_only_it_is_kept(cut_out):

@@ -205,13 +205,10 @@ class Targets(Sequence[Target]):
         frame = self.frames[index]
         loads = frame.load_depth, frame.load_valid, frame.load_moving, frame.load_covisible
         rgba, (depth, *masks) = pixels_of(frame), (load and load() for load in loads)
-        if self.factor > 1:
-            rgba = reduced(rgba, self.factor)
-            depth = None if depth is None else reduced_depth(depth, self.factor)
-            least = (1, 0.5, 1)  # shares of a block
-            masks = [
-                m if m is None else block_means(m.float(), self.factor) >= s for m, s in zip(masks, least)
-            ]
+        if (by := self.factor) > 1:
+            rgba, depth = reduced(rgba, by), None if depth is None else reduced_depth(depth, by)
+            shares = (1, 0.5, 1)  # of a block, at least
+            masks = [m if m is None else block_means(m.float(), by) >= s for m, s in zip(masks, shares)]
         valid, moving, covisible = masks
         foreground = None if depth is None else depth > 0
         if self.has_alpha:

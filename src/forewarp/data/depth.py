@@ -16,7 +16,7 @@ from forewarp.data.images import CACHE, by, read_gray16, read_image
 from forewarp.scene.camera import Camera, Lens
 from forewarp.scene.frame import spread
 
-SUFFIXES, KINDS = (".npy", ".png"), ("metric", "relative", "inverse")
+SUFFIXES = (".npy", ".png")
 MILLIMETRES = 1e-3
 LEVELS = 2  # of ARKit's confidence: 0 low, 1 medium, 2 high
 _LOOKED_AT = 4  # files that tell the unit

@@ -197,10 +197,8 @@ def _read_records(
     records, assumed = {}, []
     for split in SPLITS:
         files = _files(folder, split)
-        parts = [
-            _read_file(path, ability, axes=axes, inverse=inverse, longer=longer)
-            for path, ability in files.items()
-        ]
+        options = {"axes": axes, "inverse": inverse, "longer": longer}
+        parts = [_read_file(path, ability, **options) for path, ability in files.items()]
         records[split] = [record for part, _ in parts for record in part]
         assumed += [line for _, lines in parts for line in lines]
     everything = [record for split in SPLITS for record in records[split]]

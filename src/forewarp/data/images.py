@@ -218,13 +218,13 @@ def check_pixels(where: object, pixels: Tensor | np.ndarray, *shapes: tuple[int,
     return pixels
 
 
-def write_image(path: Path, pixels: Tensor | np.ndarray, quality: int = 97) -> None:
+def write_image(path: Path, pixels: Tensor | np.ndarray) -> None:
     """Write uint8 pixels, whole or not at all: (H, W), (H, W, 3) or, as .png, (H, W, 4).
 
-    A JPEG has full colour resolution; ``quality`` is its.
+    A JPEG has full colour resolution and little loss.
     """
     is_png = path.suffix.lower() == ".png"
-    options = {"format": "PNG"} if is_png else {"format": "JPEG", "quality": quality, "subsampling": 0}
+    options = {"format": "PNG"} if is_png else {"format": "JPEG", "quality": 97, "subsampling": 0}
     with written_whole(path) as beside:
         Image.fromarray(np.ascontiguousarray(pixels)).save(beside, **options)
 

@@ -15,6 +15,7 @@ is nerfstudio's. ``moving_from`` says where masks of motion come from, ``seconds
 
 from __future__ import annotations
 
+import os
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -26,15 +27,7 @@ from torch import Tensor
 
 from forewarp.data.arrays import read_cloud, write_array
 from forewarp.data.cameras import MOST_UNITS, SPLITS, box_of, length_of, opengl_rows, space_of
-from forewarp.data.depth import (
-    KINDS,
-    LEVELS,
-    MILLIMETRES,
-    SensedDepth,
-    confidence_of,
-    depths_beside,
-    depths_named,
-)
+from forewarp.data.depth import LEVELS, MILLIMETRES, SensedDepth, confidence_of, depths_beside, depths_named
 from forewarp.data.directions import check_directions
 from forewarp.data.files import (
     inside,
@@ -156,7 +149,7 @@ def read_scene(
     one_of(scale, "data.scale", *SCALES)
     whole(test_every, "data.test_every", 2)
     one_of(normalise, "data.normalise", True, False)
-    one_of(depth_kind, "data.depth_kind", *KINDS)
+    one_of(depth_kind, "data.depth_kind", "metric", "relative", "inverse")
     file = scene_folder(root, scene, "posed_video") / FILE
     content = stated(read_json(file))
     entries, absent, assumed = _read_entries(file, content, scale, axes, inverse, masks)
@@ -202,9 +195,8 @@ def read_scene(
         raise mismatch("data.depth", "a folder, off or null", repr(depth))
     depths, place = {}, None if depth in (None, "off") else file.parent / depth
     if depth is None:
-        named = {entry.name: entry.depth for entry in parts["train"] if entry.depth is not None}
-        depths, told_of_depths = depths_named(named)
-        assumed += told_of_depths
+        depths, lines = depths_named({e.name: e.depth for e in parts["train"] if e.depth is not None})
+        assumed += lines
     elif place is not None:
         depths = depths_beside(place, [entry.name for entry in parts["train"]])
     if depths and depth_kind != "metric" and still is None:
@@ -223,11 +215,11 @@ def read_scene(
 
     def frame(e: ImageEntry) -> Frame:
         camera_id, camera = None if e.taken_by is None else views.index(e.taken_by), space.camera(e.camera)
-        masks = {"load_valid": e.valid, "load_moving": e.moving, "load_resting": e.resting}
-        return Frame(e.name, e.time, camera, e.load, **masks, camera_id=camera_id, moment=e.moment)
+        beside = {"load_valid": e.valid, "load_moving": e.moving, "load_resting": e.resting}
+        beside["load_sensed"] = sensed(e.name, camera)
+        return Frame(e.name, e.time, camera, e.load, **beside, camera_id=camera_id, moment=e.moment)
 
     train, val, test = (tuple(map(frame, parts[split])) for split in SPLITS)
-    train = tuple(replace(f, load_sensed=sensed(f.name, f.camera)) for f in train)
     ranks = {time: n for n, time in enumerate(sorted({*times}))}
     moments = {e.name: ranks[e.time] if e.moment is None else e.moment for e in entries}
     held = held_cameras(test_cameras, views, []), held_moments(test_moments, max(moments.values()) + 1)
@@ -394,11 +386,12 @@ def _split_entries(
     listed = [split for split in SPLITS if f"{split}_filenames" in content]
     if listed:
         names = {split: _listed(file, content, f"{split}_filenames", entries, absent) for split in listed}
-        if sum(map(len, names.values())) > len(set().union(*names.values())):
+        everywhere = set().union(*names.values())
+        if sum(map(len, names.values())) > len(everywhere):
             raise mismatch(file, "lists of filenames that share none", "one in two of them")
         parts = {split: [e for e in entries if e.name in names.get(split, ())] for split in SPLITS}
         for home in [split for split in ("train", "test") if split not in listed][:1]:
-            parts[home] = [e for e in entries if not any(e.name in split for split in names.values())]
+            parts[home] = [entry for entry in entries if entry.name not in everywhere]
         how = "as listed in the file"
         if not parts["test"] and names.get("test") and names["test"] <= absent:  # never rendered
             parts["train"], parts["test"] = hold_out_every(parts["train"], test_every)
@@ -465,17 +458,17 @@ def write_scene(
     """
     folder = Path(folder)
     remove(folder, FILE, POINTS, "confidence/**/*.npy")  # which is read wherever a depth is
-    entries, lists, taken = [], {split: [] for split in SPLITS}, set()
+    entries, lists, taken = [], {split: [] for split in ("", *SPLITS)}, set()
     for shot in shots:
-        entries.append(_write_shot(folder, shot, taken) | ({} if mask is None else {"mask_path": mask}))
-        if shot.split:
-            lists[shot.split].append(entries[-1]["file_path"])
+        entries.append(_write_shot(folder, shot, taken) | stated({"mask_path": mask}))
+        lists[shot.split].append(entries[-1]["file_path"])
     common = {key: entries[0][key] for key in _OF_CAMERA if entries and key in entries[0]}
     common = {key: value for key, value in common.items() if all(e.get(key) == value for e in entries)}
-    told = {"near": near, "far": far, "seconds": seconds, "moving_from": moving_from}
-    content = {**common, **{f"{split}_filenames": names for split, names in lists.items() if names}}
-    content |= {key: value for key, value in told.items() if value is not None}
-    content |= {} if aabb is None else {"aabb": [aabb.low, aabb.high]}
+    content = {**common, **{f"{split}_filenames": lists[split] for split in SPLITS if lists[split]}}
+    corners = None if aabb is None else [aabb.low, aabb.high]
+    content |= stated(
+        {"near": near, "far": far, "seconds": seconds, "moving_from": moving_from, "aabb": corners}
+    )
     content["frames"] = [{k: v for k, v in entry.items() if k not in common} for entry in entries]
     write_array(folder / POINTS, points if points is not None and len(points) else None)
     write_json(folder / FILE, content)
@@ -483,19 +476,19 @@ def write_scene(
 
 def _write_shot(folder: Path, shot: PosedShot, taken: set[str]) -> dict:
     """Write an image and make its entry; ``taken`` are the names so far, to which this one's is added."""
-    camera, suffix, is_png = shot.camera, Path(shot.name).suffix, shot.name.lower().endswith(".png")
+    camera, stem, suffix = shot.camera, *os.path.splitext(shot.name)
     name = _name_of(folder, f"images/{shot.name}", f"shots: {shot.name!r}")
-    if suffix not in SUFFIXES:
-        raise mismatch(shot.name, f"a name in {', '.join(SUFFIXES)}", repr(suffix))
+    one_of(suffix, f"{shot.name}: suffix", *SUFFIXES)
     if name in taken:
         raise mismatch(shot.name, "names that differ without their suffix", "two alike")
     taken.add(name)
-    if shot.split not in ("", *SPLITS):
-        raise mismatch(shot.name, f"a split of {', '.join(SPLITS)}", repr(shot.split))
+    if shot.split:
+        one_of(shot.split, f"{shot.name}: split", *SPLITS)
     if camera.skew:
         raise mismatch(shot.name, "a camera without skew", f"a skew of {camera.skew:g}")
     shapes = [(camera.height, camera.width, channels) for channels in (3, 4)]
-    pixels = check_pixels(shot.name, shot.pixels, *shapes[: 2 if is_png else 1])  # a JPEG has no alpha
+    channels = 2 if suffix.lower() == ".png" else 1  # a JPEG has no alpha
+    pixels = check_pixels(shot.name, shot.pixels, *shapes[:channels])
     entry = {"file_path": f"images/{shot.name}", "w": camera.width, "h": camera.height, "fl_x": camera.fx}
     entry |= {"fl_y": camera.fy, "cx": camera.cx, "cy": camera.cy, "camera_model": "OPENCV"}
     if camera.lens is not None:
@@ -503,21 +496,17 @@ def _write_shot(folder: Path, shot: PosedShot, taken: set[str]) -> dict:
     if shot.time is not None:
         entry["time"] = number(shot.time, f"{shot.name}: time", 0, 1)
     entry["transform_matrix"] = opengl_rows(camera.camera_to_world, shot.name)
-    if shot.taken_by is not None:
-        entry["camera"] = shot.taken_by
-    if shot.moment is not None:
-        entry["moment"] = shot.moment
+    entry |= stated({"camera": shot.taken_by, "moment": shot.moment})
     write_image(folder / entry["file_path"], pixels)
     if shot.depth is not None:
-        entry["depth_file_path"] = f"depth/{shot.name.removesuffix(suffix)}.npy"
+        entry["depth_file_path"] = f"depth/{stem}.npy"
         write_array(folder / entry["depth_file_path"], shot.depth)
     if shot.confidence is not None:
         trust = np.asarray(shot.confidence)
-        trust = trust / LEVELS if trust.dtype.kind in "iu" else trust
-        write_array(folder / f"confidence/{shot.name.removesuffix(suffix)}.npy", trust)
+        write_array(folder / f"confidence/{stem}.npy", trust / LEVELS if trust.dtype.kind in "iu" else trust)
     for kind, mask in (("moving", shot.moving), ("resting", shot.resting)):
         if mask is not None:
             mask = np.uint8(255) * np.asarray(mask, bool)
-            entry[f"{kind}_path"] = f"{kind}/{shot.name.removesuffix(suffix)}.png"
+            entry[f"{kind}_path"] = f"{kind}/{stem}.png"
             write_image(folder / entry[f"{kind}_path"], check_pixels(shot.name, mask, shapes[0][:2]))
     return entry
