@@ -62,6 +62,7 @@ def test_round_trip(made):
     said = scene.protocol
     assert (said["dataset"], said["resolution"], said["test_frames"]) == ("video_with_poses", [30, 20], 1)
     assert (said["split"], said["derived"]) == ("every 8th frame held out", ["box"])
+    assert said["times"] == "from the images' names"
 
 
 def test_known_points_project_by_the_formats_formulas(tmp_path, made):

@@ -231,7 +231,7 @@ def read_scene(
     protocol = {
         "dataset": "video_with_poses",
         "resolution": [train[0].camera.width, train[0].camera.height],
-        "times": "as given" if entries[0].time is not None else "from the images' names",
+        "times": "as given" if given[entries[0].name] is not None else "from the images' names",
         "split": how,
         "test_frames": len(test),
         "normalisation": space.told,
