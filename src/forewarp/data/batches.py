@@ -63,11 +63,10 @@ class Sampler(IterableDataset):
         views_per_step: int = 1,
         asks: Asks | None = None,
     ) -> None:
-        if rays is not None and int(rays) < 1:
-            raise mismatch("data.rays", "at least 1", rays)
         one_of(background, "data.background", *COLORS, "random")
-        if int(views_per_step) < 1:
-            raise mismatch("data.views_per_step", "at least 1", views_per_step)
+        for key, count in (("rays", rays), ("views_per_step", views_per_step)):
+            if count is not None and int(count) < 1:
+                raise mismatch(f"data.{key}", "at least 1", count)
         self.frames, self.background, self.picker, self.asks = scene.train, background, picker, asks or Asks()
         self.rays = None if rays is None else int(rays)
         self.views_per_step = min(int(views_per_step), self.rays or 1)

@@ -88,13 +88,11 @@ def nearly(path: Path) -> str:
         stem = re.sub(r"(\.[a-z]\w{2,4})+$", "", name.casefold())
         return re.sub(r"\d+", lambda digits: digits[0].lstrip("0"), stem)
 
-    there = []
     with suppress(OSError):  # a folder that may not be listed
-        there = sorted(name for name in os.listdir(path.parent) if core(name) == core(path.name))
-    if not there:
-        return ""
-    advice = ": convert it to PNG or JPEG" if Path(there[0]).suffix.lower() in UNREAD else ""
-    return f"{path.parent.name}/{there[0]} is there{advice}"
+        for name in sorted(name for name in os.listdir(path.parent) if core(name) == core(path.name)):
+            advice = ": convert it to PNG or JPEG" if Path(name).suffix.lower() in UNREAD else ""
+            return f"{path.parent.name}/{name} is there{advice}"
+    return ""
 
 
 def read_bytes(path: Path, most: int = MOST_BYTES, what: str = "a readable file") -> bytes:
@@ -181,9 +179,8 @@ def inside(folder: Path, name: object, where: str) -> Path:
     """
     is_text = isinstance(name, str) and not any(category(c) in _UNPRINTABLE for c in name)
     normal = os.path.normpath(name.replace("\\", "/")) if is_text and name else ".."
-    if re.match("[A-Za-z]:", normal):  # a drive of Windows
-        normal = ".."
-    if os.path.isabs(normal) or normal.split(os.sep)[0] in ("..", "."):
+    is_drive = re.match("[A-Za-z]:", normal)  # of Windows
+    if is_drive or os.path.isabs(normal) or normal.split(os.sep)[0] in ("..", "."):
         raise mismatch(where, "a path inside the scene folder", short(name))
     return folder / normal
 
@@ -259,26 +256,24 @@ def scene_folder(root: str | Path, scene: str, reader: str) -> Path:
     root, marker = Path(root), MARKERS[reader]
     if not root.is_dir():
         raise mismatch("data.root", "an existing folder", root, "set data.root")
-    if not scene or not (root / scene / marker).is_file():
-        file = root / scene / marker
-        there = ", ".join(sorted(p.name for p in root.iterdir() if (p / marker).is_file())) or "none"
-        advice = f"scenes in {root}: {there}"
-        if scene and (other := layout_of(root / scene)):
-            advice = f"this is a scene in the layout of {other}: use {LAYOUTS[other][1]}"
-        if deeper := sorted(root.glob(f"*/{glob.escape(scene)}/{marker}")) if scene else []:
-            advice = f"did you mean data.root={deeper[0].parents[len(Path(scene).parts)]}?"
-        if (root / marker).is_file():
-            folder = root.resolve()
-            advice = f"did you mean data.root={folder.parent} data.scene={folder.name}?"
-        advice = (scene and file.parent.is_dir() and nearly(file)) or advice
-        raise mismatch(root / scene, f"a scene with {marker}", "none", advice)
-    return root / scene
+    folder = root / scene
+    if scene and (folder / marker).is_file():
+        return folder
+    there = ", ".join(sorted(p.name for p in root.iterdir() if (p / marker).is_file())) or "none"
+    advice = f"scenes in {root}: {there}"
+    if scene and (other := layout_of(folder)):
+        advice = f"this is a scene in the layout of {other}: use {LAYOUTS[other][1]}"
+    if deeper := sorted(root.glob(f"*/{glob.escape(scene)}/{marker}")) if scene else []:
+        advice = f"did you mean data.root={deeper[0].parents[len(Path(scene).parts)]}?"
+    if (root / marker).is_file():
+        advice = f"did you mean data.root={root.resolve().parent} data.scene={root.resolve().name}?"
+    advice = (scene and folder.is_dir() and nearly(folder / marker)) or advice
+    raise mismatch(folder, f"a scene with {marker}", "none", advice)
 
 
 def layout_of(folder: Path) -> str | None:
     """Name the layout of a scene's folder by the file that every scene of it has; None: of none known."""
-    there = [name for name, (marker, _) in LAYOUTS.items() if (folder / marker).exists()]
-    return there[0] if there else None
+    return next((name for name, (marker, _) in LAYOUTS.items() if (folder / marker).exists()), None)
 
 
 def remove(folder: Path, *patterns: str) -> None:
@@ -329,5 +324,5 @@ def _files(folder: Path) -> list[Path]:
         visited.add(real)
         folders[:] = sorted(name for name in folders if not name.startswith("."))
         paths = (Path(place) / name for name in sorted(names) if not name.startswith("."))
-        files += [path for path in paths if path.is_file()]
+        files += filter(Path.is_file, paths)
     return files

@@ -45,8 +45,9 @@ def hold_out(scene: Scene, count: int) -> Scene:
     """
     if whole(count, "data.held_out", 0) == 0:
         return scene
-    most, frames = most_held_out(scene), _spare(scene)
-    if count > most:
+    kept = {scene.times[0], scene.times[-1], scene.canonical_time} if len(scene.times) > 1 else set()
+    frames = sorted((f.time, i) for i, f in enumerate(scene.train) if f.time not in kept)
+    if count > (most := len(frames) // 2):
         expected = f"at most {most} of the {len(scene.train)} training frames of {scene.name}"
         raise mismatch("data.held_out", expected, count, f"set data.held_out={most}")
     chosen = {frames[(2 * i + 1) * len(frames) // (2 * count)][1] for i in range(count)}
@@ -69,17 +70,6 @@ def only(scene: Scene, count: int | None) -> Scene:
     kept = {first, *(order[i] for i in spread(len(order), count - 1))}
     train = tuple(frame for i, frame in enumerate(scene.train) if i in kept)
     return replace(scene, train=train, protocol={**scene.protocol, "train_views": count})
-
-
-def most_held_out(scene: Scene) -> int:
-    """Count the training frames that a scene can spare."""
-    return len(_spare(scene)) // 2
-
-
-def _spare(scene: Scene) -> list[tuple[float, int]]:
-    """List (time, index) of the frames that may be held out: not those at first, last and canonical time."""
-    kept = {scene.times[0], scene.times[-1], scene.canonical_time} if len(scene.times) > 1 else set()
-    return sorted((f.time, i) for i, f in enumerate(scene.train) if f.time not in kept)
 
 
 def with_canonical(scene: Scene, canonical: str | float | None) -> Scene:
