@@ -26,11 +26,8 @@ from tests.support.written_scenes import (
 def test_round_trip_of_a_stock_scene(tmp_path):
     write_dnerf(tmp_path / "toy")
     scene = read_scene(tmp_path, "toy")
-    for split, expected in (
-        ("train", dnerf_shots(4)),
-        ("val", dnerf_shots(2, 1)),
-        ("test", dnerf_shots(3, 2)),
-    ):
+    written = {"train": dnerf_shots(4), "val": dnerf_shots(2, 1), "test": dnerf_shots(3, 2)}
+    for split, expected in written.items():
         for frame, shot in zip(getattr(scene, split), expected, strict=True):
             assert frame.name == f"{split}/{shot.name}"
             assert (frame.time, frame.ability, frame.load_depth) == (shot.time, "all", None)

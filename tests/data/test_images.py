@@ -9,7 +9,6 @@ import pytest
 import torch
 from PIL import Image
 
-from forewarp.data.files import SceneError
 from forewarp.data.images import (
     _OWN_PAGES,
     CACHE,
@@ -24,6 +23,7 @@ from forewarp.data.images import (
     reduced,
     write_image,
 )
+from tests.support.written_scenes import refused
 
 NOISE = np.random.default_rng(0).integers(0, 256, (37, 53, 3), dtype=np.uint8)
 STUDIO, SKIN = (20, 160, 40), (200, 120, 100)
@@ -101,7 +101,7 @@ def test_bad_images_are_refused_in_one_line(tmp_path, name, harm):
     write_image(tmp_path / name, NOISE)
     (tmp_path / name).write_bytes(change((tmp_path / name).read_bytes()))
     for read in (inspect_image, read_image):
-        with pytest.raises(SceneError, match=rf"{name}: .*{match}") as caught:
+        with refused(rf"{name}: .*{match}") as caught:
             read(tmp_path / name)
         assert "\n" not in str(caught.value)
 
@@ -110,7 +110,7 @@ def test_bad_images_are_refused_in_one_line(tmp_path, name, harm):
 def test_images_of_other_programs_are_named(tmp_path, kind):
     Image.fromarray(NOISE).save(tmp_path / "a.png", format=kind)
     said = f"a.png: expected a PNG or JPEG image, but got {kind}; convert it to PNG or JPEG"
-    with pytest.raises(SceneError, match=said):
+    with refused(said):
         inspect_image(tmp_path / "a.png")
 
 
@@ -118,7 +118,7 @@ def test_other_kinds_of_pixel_are_refused(tmp_path):
     iio.imwrite(tmp_path / "a.png", NOISE[..., 0].astype(np.uint16))
     iio.imwrite(tmp_path / "b.jpg", RGBA, plugin="pillow", mode="CMYK")
     for name, got in (("a.png", "16 bits"), ("b.jpg", "CMYK")):
-        with pytest.raises(SceneError, match=f"8 bits a channel, grey or RGB, but got {got}; convert"):
+        with refused(f"8 bits a channel, grey or RGB, but got {got}; convert"):
             inspect_image(tmp_path / name)
 
 
