@@ -39,11 +39,8 @@ def test_axes_that_no_key_names_are_converted(kind):
         }[kind](matrix)
         converted.append(torch.from_numpy(mended @ FLIP))
     torch.testing.assert_close(torch.stack(converted), torch.stack(around()).double())
-    said = (
-        "only if x is ahead, as of ROS and Isaac; convert them"
-        if kind == "ros"
-        else r"convert poses of Unity \(left-handed\)"
-    )
+    of_ros = "only if x is ahead, as of ROS and Isaac; convert them"
+    said = of_ros if kind == "ros" else r"convert poses of Unity \(left-handed\)"
     with refused(said):
         check_directions(stored, "t.json", inverse=False)
 

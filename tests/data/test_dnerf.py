@@ -153,10 +153,8 @@ def test_depth_may_be_a_png_with_its_scale(tmp_path, place):
     folder = write_lego(tmp_path / "lift")
     steps = np.arange(48, dtype=np.uint16).reshape(6, 8) * 1000
     iio.imwrite(folder / "d.png", steps)
-    edit(
-        folder / "transforms_test_time.json",
-        {"frames.1.depth_file_path": "d.png", f"{place}depth_scale": 1e-4},
-    )
+    changes = {"frames.1.depth_file_path": "d.png", f"{place}depth_scale": 1e-4}
+    edit(folder / "transforms_test_time.json", changes)
 
     def depth(**options):
         frames = read_scene(tmp_path, "lift", **options).test

@@ -241,9 +241,7 @@ LATER = {
         ("train/r_2.png", flip, "harmed one; copy"),
         ("train/r_2.png", PIXELS[:4], "r_2.png: expected 8 x 6 pixels, but got 8 x 4"),
     ],
-    "dome": [
-        ("img/0/mask/img_0001.jpg", PIXELS[..., 0], "img_0001.jpg: expected 48 x 60 pixels, but got 8 x 6")
-    ],
+    "dome": [("img/0/mask/img_0001.jpg", PIXELS[..., 0], "0001.jpg: expected 48 x 60 pixels, but got 8 x 6")],
     "lego": [
         (DEPTH, b"", "r_0_depth.npy: expected a NumPy file"),
         (DEPTH, np.ones((8, 6)), r"shape \(6, 8\), but got shape \(8, 6\)"),

@@ -183,10 +183,7 @@ def set_to(row, column, value):
 
 
 BAD = [
-    (
-        rows(lambda a: a[:2]),
-        rf"{FILE}: expected a row for each of 3 cameras, cam00 to cam02, but got 2 rows; rem",
-    ),
+    (rows(lambda a: a[:2]), rf"{FILE}: expected a row for each of 3 cameras, cam00 to cam02, but got 2 rows"),
     (rows(lambda a: a[:, :15]), r"npy: expected 17 numbers for each camera, but got shape \(3, 15\)"),
     (lambda folder: (folder / FILE).write_bytes(b"text"), "npy: expected a NumPy file, but got one that"),
     (set_to(1, 3, np.nan), r"row 1 \(cam01\): expected 4 x 4 or 3 x 4 finite numbers"),
@@ -219,10 +216,7 @@ def test_a_harmed_rig_is_refused_in_a_line(folder, harm, match):
         ({"scale": 3}, "data.scale: expected a divisor of both sides of 48 x 32 pixels, but got 3"),
         ({"scale": 0}, "data.scale: expected a whole number of at least 1, but got 0"),
         ({"frames": 0}, "data.frames: expected a whole number of at least 1, but got 0"),
-        (
-            {"test_cameras": ["cam07"]},
-            r"data.test_cameras: expected some of .* cam00, cam01, cam02, not all, but got no camera cam07",
-        ),
+        ({"test_cameras": ["cam07"]}, r"some of .* cam00, cam01, cam02, not all, but got no camera cam07"),
         ({"test_cameras": "cam00"}, "data.test_cameras: expected some of the cameras"),
         ({"test_cameras": ["cam00", "cam01", "cam02"]}, "data.test_cameras: expected some of the cameras"),
         ({"test_cameras": []}, "expected a camera or a moment to test on, but got none; name some in"),
@@ -258,10 +252,7 @@ def test_names_of_many_cameras_are_shortened():
 def test_films_of_two_rates_or_none_at_all_are_refused(films, tmp_path):
     folder = shutil.copytree(films / "toy", tmp_path / "toy")
     write_film(folder / "cam01.mp4", numbered(6, (32, 48)), stamps="N*40")
-    match = (
-        "cam01.mp4: expected frames at the times of cam00.mp4, 30 a second, but got 25 a second, 0.02 s apart"
-    )
-    with refused(match):
+    with refused("cam01.mp4: expected .* of cam00.mp4, 30 a second, but got 25 a second, 0.02 s apart"):
         read_scene(tmp_path, "toy")
     (folder / "cam01.mp4").write_bytes(b"text")
     with refused("cam01.mp4: expected a video, but got another file; copy it again"):

@@ -49,9 +49,8 @@ def test_round_trip(written):
         for k, camera in enumerate(dome()):
             frame = frames[f"{f}/img_{k:04d}"]
             assert (frame.time, frame.ability) == (f / 2, "all" if k else "space")
-            torch.testing.assert_close(
-                frame.camera.camera_to_world, camera.camera_to_world, atol=1e-6, rtol=0
-            )
+            pose = frame.camera.camera_to_world
+            torch.testing.assert_close(pose, camera.camera_to_world, atol=1e-6, rtol=0)
             assert [getattr(frame.camera, key) for key in KEYS] == [getattr(camera, key) for key in KEYS]
             rgba, mask = frame.load().numpy(), moment.masks[k]
             assert np.array_equal(rgba[..., 3], mask)
@@ -151,14 +150,14 @@ INTRINSICS = {
 
 @pytest.mark.parametrize("case", INTRINSICS)
 def test_intrinsics_by_others(toy, case):
-    expected = [f.camera for f in read_scene(toy.parent, "toy", half_resolution=False).train]
-    path = toy / "Intrinsic.inf"
+    def intrinsics():
+        scene = read_scene(toy.parent, "toy", half_resolution=False)
+        return [[getattr(frame.camera, key) for key in KEYS] for frame in scene.train]
+
+    expected, path = intrinsics(), toy / "Intrinsic.inf"
     text = INTRINSICS[case](path.read_text())
     path.write_bytes(text if isinstance(text, bytes) else text.encode())
-    cameras = [f.camera for f in read_scene(toy.parent, "toy", half_resolution=False).train]
-    assert [[getattr(c, k) for k in KEYS] for c in cameras] == [
-        [getattr(c, k) for k in KEYS] for c in expected
-    ]
+    assert intrinsics() == expected
 
 
 def test_files_by_others(toy):

@@ -114,10 +114,8 @@ def test_points_of_a_ply_are_those_of_points_npy(tmp_path, kind):
     table = np.zeros(5, [("red", "u1"), ("x", f"{order}f4"), ("z", f"{order}f8"), ("y", f"{order}f4")])
     for axis, values in zip("xyz", points.T):
         table[axis] = values
-    head = (
-        f"ply\nformat {kind} 1.0\nelement vertex 5\nproperty uchar red\nproperty float x\nproperty double z\n"
-    )
-    head += "property float y\nelement face 1\nproperty list uchar int i\nend_header\n"
+    head = f"ply\nformat {kind} 1.0\nelement vertex 5\nproperty uchar red\nproperty float x\n"
+    head += "property double z\nproperty float y\nelement face 1\nproperty list uchar int i\nend_header\n"
     text = "\n".join(" ".join(map(str, row)) for row in table.tolist()) + "\n3 0 1 2\n"
     body = text.encode() if kind == "ascii" else table.tobytes()
     (folder / "sparse_pc.ply").write_bytes(head.encode() + body)
@@ -510,10 +508,10 @@ def test_cameras_without_names_are_not_held_out_by_name(tmp_path, made):
 def test_moments_number_instants_of_cameras_with_times_of_their_own(tmp_path):
     """Frames of one moment have other times, and all are held out together."""
     cameras, black = posed_cameras(2), np.zeros((20, 30, 3), np.uint8)
-    shots = [
-        PosedShot(f"{n}.png", cameras[n % 2], black, n / 5, taken_by=f"cam{n % 2}", moment=n // 2)
-        for n in range(6)
-    ]
+    shots = []
+    for n in range(6):
+        by = {"taken_by": f"cam{n % 2}", "moment": n // 2}
+        shots.append(PosedShot(f"{n}.png", cameras[n % 2], black, n / 5, **by))
     write_scene(tmp_path / "toy", shots, near=20.0, far=120.0)
     scene = read_scene(tmp_path, "toy", test_moments=[1])
     assert [frame.time for frame in scene.test] == pytest.approx([0.4, 0.6])

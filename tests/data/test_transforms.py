@@ -225,11 +225,7 @@ def test_times_that_miss_0_and_1_by_rounding_are_not_scaled():
         ([i / 18 for i in range(19)], [44.0, 55.0], "time of test/1: expected .* 0 to 1, but got 55"),
         ([0, 0.5, 1], [0, 50, 100], r"times of train frames: expected one .* 0 to 100, .* 0 to 1 \(train/0"),
         ([0, 50, 100], [0, 0.5, 1], "times of test frames: expected one unit .* write all times in one unit"),
-        (
-            [i / 9 for i in range(10)],
-            range(16),
-            r"train frames: expected one unit .* 0 to 15, but got 0 to 1 \(train/0",
-        ),
+        ([i / 9 for i in range(10)], range(16), r"train frames: expected one unit .* 0 to 15, .* 0 to 1 \("),
     ],
 )
 def test_times_in_two_units_are_refused(train, test, said):
