@@ -8,13 +8,12 @@ import torch
 
 from forewarp.data.batches import Sampler, Targets, color_of, pixels_of
 from forewarp.data.dnerf import read_scene
-from forewarp.data.files import SceneError
 from forewarp.data.images import StoredImage, composited
 from forewarp.data.module import DNeRFDataModule
 from forewarp.scene.camera import joined
 from forewarp.scene.frame import Frame, Scene
 from forewarp.scene.view import Asks, Moment
-from tests.support.written_scenes import dnerf_shots, write_dnerf
+from tests.support.written_scenes import dnerf_shots, refused, write_dnerf
 
 
 @pytest.fixture(scope="module")
@@ -83,10 +82,10 @@ BAD = [
 
 @pytest.mark.parametrize(("options", "match"), BAD)
 def test_bad_settings(scene, options, match):
-    with pytest.raises(SceneError, match=match):
+    with refused(match):
         Sampler(scene, **options).draw()
     assert len(Sampler(scene, rays=None, views_per_step=8, asks=Asks("pictures")).draw().observations) == 1
-    with pytest.raises(SceneError, match="data.eval_background: expected white or black, but got 'random'"):
+    with refused("data.eval_background: expected white or black, but got 'random'"):
         color_of("random")
     with pytest.raises(ValueError, match="asks: expected a kind of pixels, crops, pictures, side >= 1,"):
         Asks(side=0)
@@ -115,7 +114,7 @@ def test_targets_are_loaded_when_asked_for(scene):
 
 def test_a_reader_that_gives_no_image_is_refused(scene):
     frame = replace(scene.train[0], load=lambda: torch.zeros(6, 8, 3))
-    with pytest.raises(SceneError, match=r"r_0: expected a picture as a torch.uint8 tensor"):
+    with refused(r"r_0: expected a picture as a torch.uint8 tensor"):
         pixels_of(frame)
 
 
@@ -235,8 +234,8 @@ def test_reduced_truth_is_what_half_resolution_loads(tmp_path, depth):
 
 def test_what_cannot_be_reduced(scene, tmp_path):
     targets = Targets(scene.test, torch.ones(3), has_alpha=True)
-    with pytest.raises(SceneError, match="reduce: expected pictures with sides that 4 divides, but got 8"):
+    with refused("reduce: expected pictures with sides that 4 divides, but got 8"):
         targets.reduced(4)
     frame = replace(scene.test[0], load=StoredImage(tmp_path, (8, 6), mask=tmp_path))
-    with pytest.raises(SceneError, match="reduce: expected whole pictures, but got test/r_0 cut out"):
+    with refused("reduce: expected whole pictures, but got test/r_0 cut out"):
         Targets([frame], torch.ones(3), has_alpha=True).reduced(2)

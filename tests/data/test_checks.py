@@ -23,6 +23,7 @@ from tests.support.written_scenes import (
     dome_frames,
     edit,
     posed_cameras,
+    refused,
     write_dome,
     write_video,
 )
@@ -98,14 +99,10 @@ def test_a_film_says_how_fast_its_camera_goes_around_its_subject():
     for film, said in (
         (walked(3, seconds=2.0), line),
         (walked(3), line.replace(", 1.5 a second", "")),
-        (
-            walked(20, seconds=40.0),
-            "the camera goes 20 degrees around what it looks at, 0.5 a second: hardly",
-        ),
+        (walked(20, seconds=40.0), "the camera goes 20 degrees around what it looks at, 0.5 a second"),
     ):
-        assert [text.startswith(said) for text in remarks(film) if text.startswith("the camera goes")] == [
-            True
-        ]
+        (text,) = (text for text in remarks(film) if text.startswith("the camera goes"))
+        assert text.startswith(said)
     for film in (walked(6), walked(20, seconds=2.0), SCENE):
         assert not any("the camera goes" in text for text in remarks(film))
 
@@ -117,16 +114,10 @@ def test_a_film_says_how_fast_its_camera_goes_around_its_subject():
         (changed(train=ranged(30.0, 60.0)), r"away, with near at 30; set data.near"),
         (changed(box=Box((5, 5, 5), (6, 6, 6))), r"look at, .* lies far outside the box .*data.box=null"),
         (changed(box=Box((-0.1, -0.1, -0.1), (0.1, 0.1, 0.1))), r"\d\d% of the subject's pixels see nothing"),
-        (
-            changed(with_alpha(lambda alpha: 255 - alpha)),
-            "in 8 of 8 .* fills the edges and not the middle, as if alpha or masks",
-        ),
+        (changed(with_alpha(lambda alpha: 255 - alpha)), "in 8 of 8 .* fills the edges and not the middle"),
         (changed(with_alpha(lambda alpha: alpha * 0 + 255)), "alpha is opaque in all training images"),
         (changed(train=moved(0.3)), "principal point lies at 80% of the width and 50% of the height"),
-        (
-            changed(train=named(["0", "1", "10", "11", "2", "3", "4", "5"])),
-            "names as texts.*.10 comes where 2 is due",
-        ),
+        (changed(train=named(["0", "1", "10", "11", "2", "3", "4", "5"])), "texts.*10 comes where 2 is due"),
         (changed(still=torch.full((4, 3), 500.0)), "cameras see 0% of the 4 points that never move"),
     ],
 )
@@ -149,12 +140,10 @@ def said_of(alpha):
     return "; ".join(remarks(replace(SCENE, train=tuple(train))))
 
 
-@pytest.mark.parametrize(
-    "subject", [torso((0.2, 1), (0.25, 0.75)), torso((0, 1), (0.2, 0.7)), torso((0, 1), (0.05, 0.95))]
-)
-def test_inverted_masks_of_a_subject_that_crosses_the_edges_are_told(subject):
-    assert "alpha or masks were inverted" in said_of(255 - subject)
-    assert "inverted" not in said_of(subject)
+@pytest.mark.parametrize("sides", [((0.2, 1), (0.25, 0.75)), ((0, 1), (0.2, 0.7)), ((0, 1), (0.05, 0.95))])
+def test_inverted_masks_of_a_subject_that_crosses_the_edges_are_told(sides):
+    assert "alpha or masks were inverted" in said_of(255 - torso(*sides))
+    assert "inverted" not in said_of(torso(*sides))
 
 
 @pytest.mark.parametrize("aside", [((0, 1), (0, 0.33)), ((0, 1), (0.6, 1)), ((0.6, 1), (0, 1))])
@@ -174,6 +163,11 @@ def far_off(scale):
     return of_test(camera_to_world=pose)
 
 
+def filmed_by(change):
+    """The scene whose training cameras are changed."""
+    return replace(SCENE, train=[replace(f, camera=change(f.camera)) for f in SCENE.train])
+
+
 def with_depth(value):
     depth = torch.full((16, 16), value)
     return replace(SCENE, test=(replace(SCENE.test[0], load_depth=lambda: depth), *SCENE.test[1:]))
@@ -184,22 +178,13 @@ def with_depth(value):
     [
         (far_off(1000), r"3 of 3 test images see nothing of the box .*in other units"),
         (of_test(fx=60.0, fy=60.0), r"focal length of test images is 3.8 of .* training images 1.2 to 1.2"),
+        (with_depth(3000.0), "depth is 3000 in the median, with near at 1 and far at 5.5; write it in the"),
         (
-            with_depth(3000.0),
-            "depth is 3000 in the median, with near at 1 and far at 5.5; write it in the units",
-        ),
-        (
-            replace(SCENE, train=[replace(f, camera=replace(f.camera, fx=2.0, fy=2.0)) for f in SCENE.train]),
+            filmed_by(lambda camera: replace(camera, fx=2.0, fy=2.0)),
             "images are 152 degrees wide, as if focal lengths were in millimetres; write them in pixels",
         ),
-        (
-            replace(SCENE, train=[replace(f, camera=replace(f.camera, fy=10.0)) for f in SCENE.train]),
-            "pixels are 0.521 times as wide as high",
-        ),
-        (
-            replace(SCENE, train=[replace(f, camera=SCENE.train[0].camera) for f in SCENE.train]),
-            "in one place",
-        ),
+        (filmed_by(lambda camera: replace(camera, fy=10.0)), "pixels are 0.521 times as wide as high"),
+        (filmed_by(lambda _: SCENE.train[0].camera), "in one place"),
     ],
 )
 def test_test_images_and_focal_lengths_of_other_units_are_told(scene, said):
@@ -208,15 +193,11 @@ def test_test_images_and_focal_lengths_of_other_units_are_told(scene, said):
 
 
 def test_images_without_a_subject_are_refused_and_few_of_them_told():
-    with pytest.raises(
-        SceneError, match="r_0.*expected a subject in some .* 0 everywhere in all 8; mend alpha"
-    ):
+    with refused("r_0.*expected a subject in some .* 0 everywhere in all 8; mend alpha"):
         list(remarks(changed(with_alpha(torch.zeros_like))))
     shown = [False, True, False, False, True, False, False, False]
-    train = tuple(
-        f if on else replace(f, load=lambda f=f: torch.zeros_like(f.load()))
-        for f, on in zip(SCENE.train, shown)
-    )
+    empty = (replace(f, load=lambda f=f: torch.zeros_like(f.load())) for f in SCENE.train)
+    train = tuple(f if on else bare for f, bare, on in zip(SCENE.train, empty, shown))
     (line,) = remarks(replace(SCENE, train=train))
     assert line.startswith("6 of 8 training images looked at show no subject")
 
@@ -234,10 +215,8 @@ def test_near_and_far_of_a_file_are_told_in_its_units(tmp_path):
     write_video(tmp_path / "toy", near=1.0, far=30.0)
     (line,) = remarks(posed_video.read_scene(tmp_path, "toy"))
     at = ", ".join(f"{v:g}" for v in MIDDLE.tolist())
-    assert line == (
-        f"the point that all cameras look at, ({at}), is 70 away, with far at 30; set data.far, or mend "
-        "the file's"
-    )
+    said = f"the point that all cameras look at, ({at}), is 70 away, with far at 30"
+    assert line == f"{said}; set data.far, or mend the file's"
 
 
 def test_masks_that_leave_little_are_told(tmp_path):
@@ -246,10 +225,7 @@ def test_masks_that_leave_little_are_told(tmp_path):
     mask = np.zeros((20, 30), np.uint8)
     mask[:5] = 255
     write_image(folder / "mask.png", mask)
-    edit(
-        folder / "transforms.json",
-        lambda content: [f.update(mask_path="mask.png") for f in content["frames"]],
-    )
+    edit(folder / "transforms.json", {f"frames.{i}.mask_path": "mask.png" for i in range(10)})
     (line,) = remarks(posed_video.read_scene(tmp_path, "toy"))
     assert line.startswith("masks leave 25% of the pixels to train on")
 
@@ -271,10 +247,8 @@ def test_premultiplied_colours_are_recognised_by_edges(read, tmp_path):
         reader = dnerf.read_scene
     else:
         views = posed_cameras(4, (64, 64))
-        posed_video.write_scene(
-            tmp_path / "toy",
-            [posed_video.PosedShot(f"{i}.png", view, ball(True)) for i, view in enumerate(views)],
-        )
+        shots = [posed_video.PosedShot(f"{i}.png", view, ball(True)) for i, view in enumerate(views)]
+        posed_video.write_scene(tmp_path / "toy", shots)
         reader = posed_video.read_scene
     scene = reader(tmp_path, "toy")
     assert any("colours are taken as multiplied by alpha" in line for line in scene.protocol["assumed"])
@@ -283,9 +257,7 @@ def test_premultiplied_colours_are_recognised_by_edges(read, tmp_path):
     assert int((rgba[solid].int() - expected[solid].int()).abs().max()) <= 2
     as_is = reader(tmp_path, "toy", alpha="straight").train[0].load()
     assert torch.equal(as_is, torch.from_numpy(ball(True)))
-    with pytest.raises(
-        SceneError, match="data.alpha: expected straight, premultiplied or null, but got 'associated'"
-    ):
+    with refused("data.alpha: expected straight, premultiplied or null, but got 'associated'"):
         reader(tmp_path, "toy", alpha="associated")
 
 
@@ -328,9 +300,8 @@ def pane(size=200):
 
 def multiplied(rgba):
     """Multiply straight colours by alpha, uint8 (H, W, 4)."""
-    return np.rint(np.concatenate([rgba[..., :3] * (rgba[..., 3:] / 255), rgba[..., 3:]], -1)).astype(
-        np.uint8
-    )
+    colors = rgba[..., :3] * (rgba[..., 3:] / 255)
+    return np.rint(np.concatenate([colors, rgba[..., 3:]], -1)).astype(np.uint8)
 
 
 @pytest.mark.parametrize(
@@ -371,7 +342,7 @@ def test_smoke_is_a_subject_and_one_that_comes_late_is_only_told(tmp_path):
     empty = np.zeros((20, 30, 4), np.uint8)
     shots = [posed_video.PosedShot(f"{i}.png", view, empty) for i, view in enumerate(views)]
     posed_video.write_scene(tmp_path / "toy", shots)
-    with pytest.raises(SceneError, match=r"toy.*0\.png: expected a subject .*; set data.masks=off, or mend"):
+    with refused(r"toy.*0\.png: expected a subject .*; set data.masks=off, or mend"):
         list(remarks(posed_video.read_scene(tmp_path, "toy")))
 
 
@@ -380,12 +351,7 @@ def test_smoke_is_a_subject_and_one_that_comes_late_is_only_told(tmp_path):
     [
         ("nhr", "mend the point clouds, or set data.box=", *["mend the point clouds, or set data.box="] * 2),
         ("hypernerf", "mend near in scene.json", *["mend scene.json, or set data.box=null"] * 2),
-        (
-            "video_with_poses",
-            "set data.near, or mend the file's",
-            "set data.box=null, or mend",
-            "set data.box",
-        ),
+        ("video_with_poses", "set data.near, or mend the", "set data.box=null, or mend", "set data.box"),
         ("dnerf", "set data.near", "set data.box=null", "set data.box=null data.near=null data.far=null"),
     ],
 )
@@ -419,9 +385,8 @@ def test_a_box_far_wider_than_all_cameras_is_told_by_name(tmp_path, factor, doub
     folder = write_dome(tmp_path / "toy")
     for path in folder.glob("pointclouds/*.npy"):
         cloud = np.load(path)
-        cloud[:, :3] = [0.1, 0.05, 0.9] + factor * 0.2 * np.random.default_rng(0).uniform(
-            -1, 1, (len(cloud), 3)
-        )
+        around = np.random.default_rng(0).uniform(-0.2, 0.2, (len(cloud), 3))
+        cloud[:, :3] = [0.1, 0.05, 0.9] + factor * around
         np.save(path, cloud)
     lines = list(remarks(nhr.read_scene(tmp_path, "toy")))
     said = [line for line in lines if "times as wide as the ring of all cameras, as if point clouds" in line]
@@ -452,10 +417,8 @@ def test_all_cameras_of_a_long_walk_are_asked_for_points_at_no_cost_of_their_siz
         frames.append(Frame(f"{i}", i / 399, camera, lambda: torch.zeros(1)))
     points = torch.stack([torch.linspace(0, 399, 2000), torch.full((2000,), 3.0), torch.zeros(2000)], 1)
     box = Box((-1, 0, -1), (400, 4, 1))
-    assert (
-        list(remarks(replace(SCENE, train=tuple(frames), test=(), box=box, has_alpha=False, still=points)))
-        == []
-    )
+    street = replace(SCENE, train=tuple(frames), test=(), box=box, has_alpha=False, still=points)
+    assert list(remarks(street)) == []
     assert (len(bytes_of), sum(bytes_of)) == (400, 400)
 
 
@@ -472,7 +435,7 @@ def test_all_cameras_of_a_long_walk_are_asked_for_points_at_no_cost_of_their_siz
 )
 def test_a_middle_of_other_images_is_named(size, middle, advice):
     camera = Camera(*size, 50.0, 50.0, *middle, torch.eye(4).double(), 0.1, 1.0)
-    with pytest.raises(SceneError, match=advice):
+    with refused(advice):
         check_middle(camera, "cx")
 
 

@@ -6,10 +6,9 @@ import torch
 from PIL import Image
 
 from forewarp.data.depth import SensedDepth, confidence_of, depths_beside, line_through
-from forewarp.data.files import SceneError
 from forewarp.data.posed_video import FILE, read_scene
 from forewarp.scene.camera import Camera
-from tests.support.written_scenes import edit, write_video
+from tests.support.written_scenes import edit, refused, write_video
 
 
 def camera_of(width=32, height=24):
@@ -83,7 +82,7 @@ def test_depth_of_a_video_is_in_the_units_of_its_poses(tmp_path):
     larger = read_scene(tmp_path, "toy", depth=str(tmp_path / "lidar"), depth_scale=2e-3).train[0]
     torch.testing.assert_close(larger.load_sensed()[0], 2 * frames[larger.name].load_sensed()[0])
     edit(folder / FILE, {"frames.0.depth_file_path": "../lidar/frame_1.png"})
-    with pytest.raises(SceneError, match="depth_file_path"):
+    with refused("depth_file_path"):
         read_scene(tmp_path, "toy")
     (tmp_path / "lidar").rename(folder / "lidar")
     edit(folder / FILE, {"frames.0.depth_file_path": "lidar/frame_1.png"})
@@ -95,7 +94,7 @@ def test_depth_of_a_video_is_in_the_units_of_its_poses(tmp_path):
     (line,) = (line for line in scene.protocol["assumed"] if "depth" in line.rpartition("/")[2])
     assert line.endswith("lidar/none.png: 1 of 2 depths are not there: images go without")
     edit(folder / FILE, {"frames.1.depth_file_path": "lidar/2.exr"})
-    with pytest.raises(SceneError, match=r"2.exr: expected a depth in .npy or .png, but got .exr; .*=off"):
+    with refused(r"2.exr: expected a depth in .npy or .png, but got .exr; .*=off"):
         read_scene(tmp_path, "toy")
     edit(folder / FILE, {"frames.0.depth_file_path": "2.npy", "frames.1.depth_file_path": "2.npy"})
     np.save(folder / "2.npy", np.full((10, 15), 40.0))
@@ -112,7 +111,7 @@ def test_confidences_lie_as_depths_do_and_a_depth_is_of_one_image(tmp_path):
     places = [confidence_of(found[name], tmp_path / "depth") for name in names]
     assert places == [tmp_path / "confidence" / camera / "1.npy" for camera in ("cam0", "cam1")]
     np.save(tmp_path / "1.npy", np.ones((2, 3)))
-    with pytest.raises(SceneError, match="1.npy: expected a depth for each image, but got one for images/c"):
+    with refused("1.npy: expected a depth for each image, but got one for images/c"):
         depths_beside(tmp_path, names)
 
 
@@ -121,20 +120,11 @@ def test_confidences_lie_as_depths_do_and_a_depth_is_of_one_image(tmp_path):
     [
         ({"depth": "nowhere"}, "data.depth: expected a folder of depths, but got .*nowhere; set data.depth="),
         ({"depth": "images"}, "images: expected depths|expected a grey PNG of 16 bits"),
-        (
-            {"depth_kind": "deep"},
-            "data.depth_kind: expected one of metric, relative, inverse, but got 'deep'",
-        ),
-        (
-            {"depth": "some", "depth_kind": "inverse"},
-            "data.depth_kind: expected points that never move, to fit",
-        ),
+        ({"depth_kind": "deep"}, "data.depth_kind: expected metric, relative or inverse, but got 'deep'"),
+        ({"depth": "some", "depth_kind": "inverse"}, "data.depth_kind: expected points that never move, to"),
         ({"depth": "some", "depth_scale": 0}, "data.depth_scale: expected"),
         ({"depth": False}, "data.depth: expected a folder, off or null, but got False"),
-        (
-            {"depth": "other"},
-            "other: expected depths named as images, frame_1.npy or .png, but got none of them",
-        ),
+        ({"depth": "other"}, "other: expected depths named as images, frame_1.npy or .png, but got none of"),
     ],
 )
 def test_bad_depth_of_a_video_is_refused_in_a_line(tmp_path, options, message):
@@ -142,6 +132,6 @@ def test_bad_depth_of_a_video_is_refused_in_a_line(tmp_path, options, message):
     for name, file in (("some", "frame_1"), ("other", "a")):
         (folder / name).mkdir()
         np.save(folder / name / f"{file}.npy", np.ones((20, 30)))
-    with pytest.raises(SceneError, match=message) as caught:
+    with refused(message) as caught:
         [frame.load_sensed() for frame in read_scene(tmp_path, "toy", **options).train if frame.load_sensed]
     assert "\n" not in str(caught.value)

@@ -26,11 +26,8 @@ from tests.support.written_scenes import (
 def test_round_trip_of_a_stock_scene(tmp_path):
     write_dnerf(tmp_path / "toy")
     scene = read_scene(tmp_path, "toy")
-    for split, expected in (
-        ("train", dnerf_shots(4)),
-        ("val", dnerf_shots(2, 1)),
-        ("test", dnerf_shots(3, 2)),
-    ):
+    written = {"train": dnerf_shots(4), "val": dnerf_shots(2, 1), "test": dnerf_shots(3, 2)}
+    for split, expected in written.items():
         for frame, shot in zip(getattr(scene, split), expected, strict=True):
             assert frame.name == f"{split}/{shot.name}"
             assert (frame.time, frame.ability, frame.load_depth) == (shot.time, "all", None)
@@ -156,10 +153,8 @@ def test_depth_may_be_a_png_with_its_scale(tmp_path, place):
     folder = write_lego(tmp_path / "lift")
     steps = np.arange(48, dtype=np.uint16).reshape(6, 8) * 1000
     iio.imwrite(folder / "d.png", steps)
-    edit(
-        folder / "transforms_test_time.json",
-        {"frames.1.depth_file_path": "d.png", f"{place}depth_scale": 1e-4},
-    )
+    changes = {"frames.1.depth_file_path": "d.png", f"{place}depth_scale": 1e-4}
+    edit(folder / "transforms_test_time.json", changes)
 
     def depth(**options):
         frames = read_scene(tmp_path, "lift", **options).test

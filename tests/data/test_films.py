@@ -9,12 +9,11 @@ import pytest
 import torch
 
 from forewarp.data import films
-from forewarp.data.files import SceneError
 from forewarp.data.films import STORE, Film, FilmStore, films_of
 from forewarp.data.images import CACHE
 from forewarp.data.module import MulticamDataModule
 from tests.support.films import numbered, write_film
-from tests.support.written_scenes import fixed_cameras, write_multicam
+from tests.support.written_scenes import fixed_cameras, refused, write_multicam
 
 COUNT, SIZE = 4, (24, 16)
 BYTES = 3 * 24 * 16 * COUNT  # of a film
@@ -53,7 +52,7 @@ def data_of(root, place, **options):
     return data
 
 
-def refused(*_):
+def decoded_again(*_):
     raise AssertionError("a film was decoded again")
 
 
@@ -67,7 +66,7 @@ def test_frames_are_the_same_as_from_memory_and_what_they_take_is_told_before(
     assert f"frames 100% | {2 * COUNT}/{2 * COUNT} in 0:0" in told.splitlines()[-1]
     assert "assumed" not in data.scene.protocol
     frames = [*data.scene.train, *data.scene.test]
-    monkeypatch.setattr(Film, "decoded", refused)
+    monkeypatch.setattr(Film, "decoded", decoded_again)
     stored = [frame.load() for frame in frames]
     data_of(root, tmp_path / ".frames").setup()
     assert capsys.readouterr().err == ""  # another run shares them
@@ -134,7 +133,7 @@ def test_a_longer_part_of_a_film_is_decoded_anew_and_a_shorter_one_is_not(root, 
     store.fill([film_at(path, 2)])
     whole = store.frame(film_at(path), 3)
     assert [len(file.read_bytes()) for file in tmp_path.glob("*.rgb")] == [BYTES]
-    monkeypatch.setattr(Film, "decoded", refused)
+    monkeypatch.setattr(Film, "decoded", decoded_again)
     store.fill([film_at(path, 3)])
     assert (store.frame(film_at(path), 3) == whole).all()
 
@@ -152,15 +151,15 @@ def test_a_file_that_was_cut_off_or_removed_is_made_again(film, tmp_path):
 def test_too_little_room_is_refused_in_a_line_and_nothing_is_written(film, tmp_path, monkeypatch):
     store = FilmStore(tmp_path, BYTES - 1)
     match = rf"disk_cache_bytes: expected at least {BYTES} .* of 1 film.*, but got {BYTES - 1};"
-    with pytest.raises(SceneError, match=match) as caught:
+    with refused(match) as caught:
         store.fill([film])
     assert "raise it, set a larger data.scale or fewer data.frames, or 0 to seek" in str(caught.value)
     usage = shutil.disk_usage(tmp_path)._replace(free=films._RESERVE + BYTES - 1)
     monkeypatch.setattr(films.shutil, "disk_usage", lambda _: usage)
-    with pytest.raises(SceneError, match=r"but got 4.61e-06 GB free; set .*, or run=<a folder on a larger"):
+    with refused(r"but got 4.61e-06 GB free; set .*, or run=<a folder on a larger"):
         FilmStore(tmp_path).fill([film])
     assert [*tmp_path.iterdir()] == []
-    with pytest.raises(SceneError, match="data.disk_cache_bytes: expected a number"):
+    with refused("data.disk_cache_bytes: expected a number"):
         store.resize(None, -1)
 
 
@@ -174,7 +173,7 @@ def test_files_that_nobody_uses_make_room_the_oldest_first(root, small, tmp_path
     store.fill([film_at(root / "toy" / "cam00.mp4")])
     assert [path.exists() for path in (old, middle, used, foreign)] == [False, True, True, True]
     os.utime(middle)
-    with pytest.raises(SceneError, match="GB of it in use"):
+    with refused("GB of it in use"):
         store.fill([film_at(root / "toy" / "cam01.mp4")])
 
 

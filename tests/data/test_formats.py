@@ -13,7 +13,6 @@ from PIL import Image
 
 from forewarp.data import dnerf, hypernerf, nhr, posed_video
 from forewarp.data.dnerf import Shot
-from forewarp.data.files import SceneError
 from forewarp.data.nhr import DomeFrame
 from forewarp.data.posed_video import PosedShot
 from tests.support.written_scenes import (
@@ -29,6 +28,7 @@ from tests.support.written_scenes import (
     hand,
     posed_cameras,
     posed_shots,
+    refused,
     rig,
     write_dnerf,
     write_dome,
@@ -128,15 +128,11 @@ BAD = {
             lambda c: [f.update(transform_matrix=[*zip(*f["transform_matrix"])]) for f in c["frames"]],
             r"the last row 0 0 0 1, but got \[.*; transpose it",
         ),
-        (
-            T,
-            {"frames.1.time": "1"},
-            r"frames\[1\].time: expected a number in \[-1e\+20, 1e\+20\], but got '1'",
-        ),
+        (T, {"frames.1.time": "1"}, r"time: expected a number in \[-1e\+20, 1e\+20\], but got '1'"),
         (T, {"frames.0.time": 50, "frames.1.time": 99}, "times of test frames: expected one unit in all spl"),
         (T, {"frames.1.depth_file_path": "/etc/x"}, f"depth_file_path: {OUT}"),
         (T, {"frames.1.depth_file_path": "e" * 999}, "depth_file_path: expected an existing file"),
-        (T, {"frames.1.ability": "flight"}, "ability: expected one of space, time, canonical"),
+        (T, {"frames.1.ability": "flight"}, "ability: expected space, time, canonical or all"),
         ("train/r_2.png", flip, f"r_2.png: {WHOLE}"),
         ("train/r_2.png", PIXELS[:4, :4], "r_2.png: expected 8 x 6 pixels as the first, but got 4 x 4"),
         ("transforms_test_time.json", b"{}", "test.json: expected it or one file per ability, but got both"),
@@ -164,7 +160,7 @@ BAD = {
         (WORLD, {"scale": GONE}, "scene.json: scale: expected a number .*got None"),
         (WORLD, {"near": 9}, "scene.json: near, far: expected near < far, but got 9 and 1.4"),
         (ITEMS, lambda c: c["ids"].append(ITEM), "ids: expected a list of different names"),
-        (ITEMS, {"train_ids": ["x"]}, "train_ids: expected items of ids, but got 'x'"),
+        (ITEMS, {"train_ids": ["x"]}, "train_ids: expected items of dataset.json's ids, but got 'x'"),
         (ITEMS, {"val_ids": ["left1_000000"]}, "val_ids: expected none of train_ids, but got 'left1"),
         (ITEMS, {"train_ids": []}, "train_ids: expected at least one beside val_ids"),
         (ITEMS, {"ids": [ITEM], "train_ids": [], "val_ids": []}, "ids: expected more than 4 items"),
@@ -190,7 +186,7 @@ BAD = {
         (FRAMES, {"fl_x": GONE, "fl_y": GONE}, "fl_x: expected fl_x or camera_angle_x, but got neither"),
         (FRAMES, {"frames.1.fl_x": -30}, r"frames\[1\].fl_x: expected a number in .*got -30"),
         (FRAMES, {"w": 60}, "frame_1.png: expected 60 x 20 pixels as .*json: w and h say, but got 30 x 20"),
-        (FRAMES, {"camera_model": "OPENCV_FISHEYE"}, "json: camera_model: expected one of OPENCV, .*FISHEYE"),
+        (FRAMES, {"camera_model": "OPENCV_FISHEYE"}, "json: camera_model: expected OPENCV, .*FISHEYE"),
         (FRAMES, {"k4": 0.1}, "json: k4: expected 0, but got 0.1; undistort the images"),
         (FRAMES, {"k1": -40}, "json: k1: expected a lens that can be undone all over the picture, but got"),
         (FRAMES, {"near": -1}, r"json: near: expected a number in \[0, 1e\+09\], but got -1"),
@@ -206,17 +202,9 @@ BAD = {
         (POSES, line(2, lambda w: [w[0] + "0", *w[1:3], *w[:3], *w[6:]]), "line 2: expected a rotation"),
         (POSES, line(4, None), "Intrinsic.inf: expected as many cameras .*got 4 there and 3 in"),
         (".", lambda p: write_dome(p, dome(1), 1), "expected at least 2 cameras, one to"),
-        (
-            ".",
-            lambda p: write_dome(p, dome(2, sizes=((1, 1),)), 1),
-            "at least 2 x 2 pixels to halve",
-        ),
+        (".", lambda p: write_dome(p, dome(2, sizes=((1, 1),)), 1), "at least 2 x 2 pixels to halve"),
         (LENSES, None, "expected a readable file, but got No such file"),
-        (
-            LENSES,
-            line(2, lambda w: w[:2]),
-            "line 1: expected the number 0 of a camera .* got 0 70 0.7 0 71.5",
-        ),
+        (LENSES, line(2, lambda w: w[:2]), "line 1: expected the number 0 of .* got 0 70 0.7 0 71.5"),
         (LENSES, line(4, lambda w: "002"), "line 1: expected the number 0 .* fx s cx, .* 0 0 2$"),
         (LENSES, line(6, lambda w: "2"), "line 6: expected the number 1 of a camera"),
         (LENSES, line(19, None), "line 16: expected 10 finite numbers, but got 7 values"),
@@ -242,7 +230,7 @@ def rows(table):
 def test_a_harmed_scene_is_refused_when_it_is_read(scene, name, file, how, match):
     folder = scene(name)
     harm(folder / file, how)
-    with pytest.raises(SceneError, match=match) as caught:
+    with refused(match) as caught:
         READ[name](folder.parent, name)
     assert "\n" not in str(caught.value)
     assert str(folder) in str(caught.value)
@@ -253,9 +241,7 @@ LATER = {
         ("train/r_2.png", flip, "harmed one; copy"),
         ("train/r_2.png", PIXELS[:4], "r_2.png: expected 8 x 6 pixels, but got 8 x 4"),
     ],
-    "dome": [
-        ("img/0/mask/img_0001.jpg", PIXELS[..., 0], "img_0001.jpg: expected 48 x 60 pixels, but got 8 x 6"),
-    ],
+    "dome": [("img/0/mask/img_0001.jpg", PIXELS[..., 0], "0001.jpg: expected 48 x 60 pixels, but got 8 x 6")],
     "lego": [
         (DEPTH, b"", "r_0_depth.npy: expected a NumPy file"),
         (DEPTH, np.ones((8, 6)), r"shape \(6, 8\), but got shape \(8, 6\)"),
@@ -277,7 +263,7 @@ def test_what_goes_bad_later_is_refused_when_it_is_loaded(scene, name, file, how
     whole = READ[name](folder.parent, name)
     harm(folder / file, how)
     loads = [load for f in (*whole.train, *whole.test) for load in (f.load, f.load_depth) if load is not None]
-    with pytest.raises(SceneError, match=match) as caught:
+    with refused(match) as caught:
         _ = [load() for load in loads]
     assert "\n" not in str(caught.value)
 
@@ -293,10 +279,7 @@ OPTIONS = {
         ({"scale": 8}, "8x: expected a folder of images.* set data.scale .*: 1x, 2x$"),
     ],
     "dome": [
-        (
-            {"test_cameras": [4]},
-            r"test_cameras: expected some of the cameras 0, 1, 2, 3, not all, but got no camera 4",
-        ),
+        ({"test_cameras": [4]}, r"some of the cameras 0, 1, 2, 3, not all, but got no camera 4"),
         ({"test_cameras": [1, 1]}, "data.test_cameras: expected"),
         ({"test_moments": [3]}, "data.test_moments: expected numbers of 0 to 2"),
         ({"frames": 0}, "data.frames: expected a whole number of at least 1, but got 0"),
@@ -304,10 +287,10 @@ OPTIONS = {
         ({"half_resolution": "auto"}, "data.half_resolution: expected true or false, but got 'auto'"),
     ],
     "video": [
-        ({"scale": 3}, r"data.scale: expected one of \(1, 2, 4, 8\), but got 3"),
+        ({"scale": 3}, r"data.scale: expected 1, 2, 4 or 8, but got 3"),
         ({"scale": 2}, "expected the images that it lists, as .*images_2/frame_1.png, but got none of them"),
         ({"near": 200}, "expected near < far, but got 200 and 120; set data.near, data.far"),
-        ({"far": 0}, "data.far: expected a number"),
+        ({"far": -1}, "data.far: expected a number"),
         ({"normalise": "yes"}, "data.normalise: expected true or false, but got 'yes'"),
         ({"test_every": 1}, "data.test_every: expected a whole number of at least 2, but got 1"),
     ],
@@ -316,21 +299,21 @@ OPTIONS = {
 
 @pytest.mark.parametrize(("name", "options", "match"), rows(OPTIONS))
 def test_bad_options(written, name, options, match):
-    with pytest.raises(SceneError, match=match):
+    with refused(match):
         READ[name](written, name, **options)
 
 
 @pytest.mark.parametrize("name", READ)
 def test_a_missing_scene_names_those_that_exist(written, name):
-    with pytest.raises(SceneError, match=rf"expected a scene with .*; scenes in .*: .*\b{name}\b"):
+    with refused(rf"expected a scene with .*; scenes in .*: .*\b{name}\b"):
         READ[name](written, "nowhere")
-    with pytest.raises(SceneError, match="data.root: expected an existing folder"):
+    with refused("data.root: expected an existing folder"):
         READ[name](written / "nowhere", name)
 
 
 def test_sides_that_cannot_be_halved(tmp_path):
     write_dnerf(tmp_path / "odd", size=(5, 8))
-    with pytest.raises(SceneError, match="expected even sides to halve, but got 8 x 5"):
+    with refused("expected even sides to halve, but got 8 x 5"):
         dnerf.read_scene(tmp_path, "odd", half_resolution=True)
 
 
@@ -338,7 +321,7 @@ def test_smaller_images_need_a_folder(scene):
     folder = scene("video")
     (folder / "images" / "frame_1.png").rename(folder / "frame_1.png")
     edit(folder / FRAMES, {"frames.0.file_path": "frame_1.png"})
-    with pytest.raises(SceneError, match="expected images in a folder, but got frame_1; set data.scale=1"):
+    with refused("expected images in a folder, but got frame_1; set data.scale=1"):
         posed_video.read_scene(folder.parent, "video", scale=2)
 
 
@@ -381,8 +364,8 @@ UNWRITABLE = {
         ([replace(POSED, camera=replace(ONE, skew=1.0))], "a camera without skew, but got a skew of 1"),
         ([replace(POSED, camera=replace(ONE, camera_to_world=torch.zeros(4, 4)))], "a rotation"),
         ([replace(POSED, time=2.0)], "a.png: time: expected a number in"),
-        ([replace(POSED, split="training")], "expected a split of train, val, test, but got"),
-        ([replace(POSED, name="a.tif")], "a.tif: expected a name in .png, .*, but got '.tif'"),
+        ([replace(POSED, split="training")], "a.png: split: expected train, val or test, but got"),
+        ([replace(POSED, name="a.tif")], "a.tif: suffix: expected .png, .*, but got '.tif'"),
         ([replace(POSED, name="a.jpg", pixels=np.dstack([RGB, RGB[..., :1]]))], r"\(20, 30, 3\), but got"),
         ([replace(POSED, name="../../a.png")], "expected a path inside the scene folder"),
         ([POSED, replace(POSED, name="./a.jpg")], "a.*: expected names that differ without"),
@@ -391,7 +374,7 @@ UNWRITABLE = {
 
 
 def test_a_dome_has_no_lenses(tmp_path):
-    with pytest.raises(SceneError, match="cameras: expected none with a lens, as the format has none"):
+    with refused("cameras: expected none with a lens, as the format has none"):
         nhr.write_scene(tmp_path, [ONE], [DOME])
 
 
@@ -426,17 +409,13 @@ def test_images_turned_by_a_quarter_are_named(scene, name):
     folder = scene(name)
     with Image.open(file := READ[name](folder.parent, name).train[1].load.path) as image:
         image.rotate(90, expand=True).save(file)
-    with pytest.raises(SceneError, match=rf"{file.name}: .*width and height are exchanged: turn its pixels"):
+    with refused(rf"{file.name}: .*width and height are exchanged: turn its pixels"):
         READ[name](folder.parent, name)
 
 
 TWO_VIEWS, SPLITS = dome(2), ["train"] * 5 + ["test"] * 5
 FORMATS = {  # what reads it, what writes a scene with all that may be there, what writes shots and no more
-    "dnerf": (
-        dnerf.read_scene,
-        write_lego,
-        lambda folder, cut: write_dnerf(folder, test=cut(dnerf_shots(2))),
-    ),
+    "dnerf": (dnerf.read_scene, write_lego, lambda f, cut: write_dnerf(f, test=cut(dnerf_shots(2)))),
     "hypernerf": (
         hypernerf.read_scene,
         lambda f: write_rig(f, points=np.zeros((1, 3)), trajectories=RIG_TRUTH),
@@ -466,7 +445,7 @@ def test_a_rewritten_scene_keeps_nothing_of_the_old_one(tmp_path, name):
     write(tmp_path / "toy")
     with pytest.raises(KeyboardInterrupt):
         rewrite(tmp_path / "toy", cut_short)
-    with pytest.raises(SceneError, match="expected a scene with"):
+    with refused("expected a scene with"):
         read(tmp_path, "toy")
     for folder in ("toy", "fresh"):
         rewrite(tmp_path / folder, iter)

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 import torch
 
+from forewarp.data.cameras import smaller
 from forewarp.data.depth import SensedDepth
-from forewarp.data.files import SceneError
-from forewarp.data.hypernerf import read_camera, read_scene, reduced, write_camera
+from forewarp.data.hypernerf import read_camera, read_scene, write_camera
 from forewarp.data.images import write_image
 from tests.support import reference
 from tests.support.written_scenes import (
@@ -28,6 +28,7 @@ from tests.support.written_scenes import (
     hand,
     phone,
     real,
+    refused,
     rig,
     write_rig,
 )
@@ -130,9 +131,7 @@ def test_time_ids_in_two_units_and_of_one_moment_are_named(tmp_path):
     folder = write_rig(tmp_path / "toy", rig(times=24))
     val = json.loads((folder / "dataset.json").read_text())["val_ids"]
     edit(folder / "metadata.json", lambda c: [c[i].update(time_id=100 * c[i]["time_id"]) for i in val])
-    with pytest.raises(
-        SceneError, match=r"times of train frames: expected one unit .* 0 to 2300, but got 0 to"
-    ):
+    with refused(r"times of train frames: expected one unit .* 0 to 2300, but got 0 to"):
         read_scene(tmp_path, "toy")
     edit(folder / "metadata.json", lambda c: [entry.update(time_id=7) for entry in c.values()])
     (line,) = read_scene(tmp_path, "toy").protocol["assumed"]
@@ -143,16 +142,14 @@ def test_no_item_leaves_the_scene(tmp_path):
     folder = write_rig(tmp_path / "toy")
     edit(folder / "dataset.json", {"ids.0": "../x", "train_ids.0": "../x"})
     edit(folder / "metadata.json", lambda c: c.update({"../x": {"time_id": 0}}))
-    with pytest.raises(SceneError, match="dataset.json: ids: expected a path inside the scene"):
+    with refused("dataset.json: ids: expected a path inside the scene"):
         read_scene(tmp_path, "toy")
 
 
 def test_a_fisheye_is_named(tmp_path):
     folder = write_rig(tmp_path / "toy")
     edit(folder / "camera" / "left1_000000.json", {"camera_type": "fisheye"})
-    with pytest.raises(
-        SceneError, match="000.json: camera_type: expected a pinhole camera, but got 'fisheye'"
-    ):
+    with refused("000.json: camera_type: expected a pinhole camera, but got 'fisheye'"):
         read_scene(tmp_path, "toy")
 
 
@@ -160,7 +157,7 @@ def test_intrinsics_of_larger_images_are_named(tmp_path):
     folder = write_rig(tmp_path / "toy", rig())
     for file in (folder / "camera").iterdir():
         edit(file, lambda content: content.update(principal_point=content["image_size"]))
-    with pytest.raises(SceneError, match="principal_point: expected .* are of images 2 times as large"):
+    with refused("principal_point: expected .* are of images 2 times as large"):
         read_scene(tmp_path, "toy", scale=1)
 
 
@@ -199,7 +196,7 @@ def test_camera_files_that_hold_another_pose_are_named(changes, said, tmp_path):
 def test_both_spellings_of_the_tangential_distortion(tmp_path):
     path = tmp_path / "camera.json"
     write_camera(path, phone(1, size=(1073, 719)))
-    small = reduced(read_camera(path, 1, 2), 4)
+    small = smaller(read_camera(path, 1, 2), 4)
     assert (small.width, small.height, small.lens) == (268, 180, LENS)  # rounded
     edit(path, {"tangential": [0.001, 0.002]})
     assert read_camera(path, 1, 2).lens.p == (0.001, 0.002)
@@ -288,7 +285,7 @@ def test_depths_may_be_millimetres(tmp_path):
     torch.testing.assert_close(scene.train[1].load_sensed(), expected.train[1].load_sensed())
     assert "thousandths" in scene.protocol["assumed"][0]
     write_rig(folder, film(unit=50.0))
-    with pytest.raises(SceneError, match="expected depths between near and far, 1.5 and 7 in the cameras'"):
+    with refused("expected depths between near and far, 1.5 and 7 in the cameras'"):
         read_scene(tmp_path, "b", depth="depth")
 
 
@@ -303,12 +300,10 @@ def test_splits_take_the_place_of_the_lists(tmp_path):
         assert [f.name for f in scene.train] == train
         assert [f.name for f in scene.test] == (test or ["1_00000", "1_00001"])
     edit(folder / "splits" / "val.json", {"frame_names.0": "0_00001"})
-    with pytest.raises(
-        SceneError, match="val.json: frame_names: expected none of train.json, but got '0_000"
-    ):
+    with refused("val.json: frame_names: expected none of train.json, but got '0_000"):
         read_scene(tmp_path, "toy")
     edit(folder / "splits" / "val.json", {"frame_names.0": "none"})
-    with pytest.raises(SceneError, match="val.json: frame_names: expected items of dataset.json, but got"):
+    with refused("val.json: frame_names: expected items of dataset.json's ids, but got"):
         read_scene(tmp_path, "toy")
 
 
@@ -325,10 +320,7 @@ def test_pixels_of_alpha_0_are_unknown(tmp_path):
 BAD = {
     "depth/2x/0_00001.npy": (np.zeros((4, 6, 2)), "expected depths \\(H, W\\), but got shape \\(4, 6, 2\\)"),
     "depth/2x/0_00002.npy": (-np.ones((4, 6)), "expected depths >= 0, but got -1; write 0 where"),
-    "confidence/2x/0_00001.npy": (
-        np.ones((4, 5)),
-        "expected 6 x 4 confidences as 0_00001.npy, but got 5 x 4",
-    ),
+    "confidence/2x/0_00001.npy": (np.ones((4, 5)), "expected 6 x 4 .* 0_00001.npy, but got 5 x 4"),
     "confidence/2x/0_00002.npy": (np.full((4, 6), 1.5), "expected confidences from 0 to 1, or levels"),
 }
 
@@ -338,17 +330,17 @@ def test_bad_depth_is_refused_in_a_line(tmp_path, name):
     array, message = BAD[name]
     folder = write_rig(tmp_path / "toy", film())
     np.save(folder / name, array)
-    with pytest.raises(SceneError, match=f"{name.split('/')[-1]}: {message}"):
+    with refused(f"{name.split('/')[-1]}: {message}"):
         [frame.load_sensed() for frame in read_scene(tmp_path, "toy", depth="depth").train]
 
 
 def test_absent_depth_is_refused_in_a_line(tmp_path):
     folder = write_rig(tmp_path / "toy", rig())
-    with pytest.raises(SceneError, match="data.depth: expected a folder of depths, but got .*/depth/2x; set"):
+    with refused("data.depth: expected a folder of depths, but got .*/depth/2x; set"):
         read_scene(tmp_path, "toy", depth="depth")
     (folder / "keypoint" / "2x" / "train").mkdir(parents=True)
     (folder / "keypoint" / "2x" / "train" / "left1_000000.json").write_text("[[1, 2]]")
-    with pytest.raises(SceneError, match=r"000000.json: expected a list of \[x, y, seen\], but got"):
+    with refused(r"000000.json: expected a list of \[x, y, seen\], but got"):
         read_scene(tmp_path, "toy")
 
 
@@ -363,7 +355,5 @@ def test_depth_of_another_size_is_taken_at_the_nearest_pixel(tmp_path):
     torch.testing.assert_close((depth * along.reshape(8, 12)).double(), expected, rtol=1e-5, atol=0)
     assert trust[::4, ::4].tolist() == [[0, 0.5, 1], [1, 1, 0]]
     np.save(tmp_path / "a.npy", np.ones((4, 4)))
-    with pytest.raises(
-        SceneError, match="expected depths of the proportions of its image, 12 x 8 pixels, but"
-    ):
+    with refused("expected depths of the proportions of its image, 12 x 8 pixels, but"):
         SensedDepth(tmp_path / "a.npy", camera, 1.0)()

@@ -9,7 +9,6 @@ import pytest
 import torch
 from PIL import Image
 
-from forewarp.data.files import SceneError
 from forewarp.data.images import (
     _OWN_PAGES,
     CACHE,
@@ -24,6 +23,7 @@ from forewarp.data.images import (
     reduced,
     write_image,
 )
+from tests.support.written_scenes import refused
 
 NOISE = np.random.default_rng(0).integers(0, 256, (37, 53, 3), dtype=np.uint8)
 STUDIO, SKIN = (20, 160, 40), (200, 120, 100)
@@ -101,7 +101,7 @@ def test_bad_images_are_refused_in_one_line(tmp_path, name, harm):
     write_image(tmp_path / name, NOISE)
     (tmp_path / name).write_bytes(change((tmp_path / name).read_bytes()))
     for read in (inspect_image, read_image):
-        with pytest.raises(SceneError, match=rf"{name}: .*{match}") as caught:
+        with refused(rf"{name}: .*{match}") as caught:
             read(tmp_path / name)
         assert "\n" not in str(caught.value)
 
@@ -110,7 +110,7 @@ def test_bad_images_are_refused_in_one_line(tmp_path, name, harm):
 def test_images_of_other_programs_are_named(tmp_path, kind):
     Image.fromarray(NOISE).save(tmp_path / "a.png", format=kind)
     said = f"a.png: expected a PNG or JPEG image, but got {kind}; convert it to PNG or JPEG"
-    with pytest.raises(SceneError, match=said):
+    with refused(said):
         inspect_image(tmp_path / "a.png")
 
 
@@ -118,7 +118,7 @@ def test_other_kinds_of_pixel_are_refused(tmp_path):
     iio.imwrite(tmp_path / "a.png", NOISE[..., 0].astype(np.uint16))
     iio.imwrite(tmp_path / "b.jpg", RGBA, plugin="pillow", mode="CMYK")
     for name, got in (("a.png", "16 bits"), ("b.jpg", "CMYK")):
-        with pytest.raises(SceneError, match=f"8 bits a channel, grey or RGB, but got {got}; convert"):
+        with refused(f"8 bits a channel, grey or RGB, but got {got}; convert"):
             inspect_image(tmp_path / name)
 
 
@@ -128,11 +128,10 @@ def cut_out(tmp_path):
     image = np.broadcast_to(np.array(STUDIO, np.uint8), (31, 40, 3)).copy()
     mask = np.zeros((31, 40), np.uint8)
     image[8:21, 5:31], mask[8:21, 5:31] = SKIN, 255
-    write_image(tmp_path / "image.jpg", image, quality=100)
-    write_image(tmp_path / "mask.jpg", mask)
-    return lambda **options: StoredImage(
-        tmp_path / "image.jpg", (40, 31), mask=tmp_path / "mask.jpg", **options
-    )
+    paths = tmp_path / "image.jpg", tmp_path / "mask.jpg"
+    Image.fromarray(image).save(paths[0], quality=100, subsampling=0)
+    write_image(paths[1], mask)
+    return lambda **options: StoredImage(paths[0], (40, 31), mask=paths[1], **options)
 
 
 def test_the_foreground_is_cut_out_and_only_it_is_kept(cut_out):
@@ -149,7 +148,7 @@ def test_the_foreground_is_cut_out_and_only_it_is_kept(cut_out):
 
 
 def test_halves_cut_off_an_odd_row_and_mix_in_no_studio(cut_out):
-    rgba = cut_out(halve=True)()
+    rgba = cut_out(factor=2)()
     assert rgba.shape == (15, 20, 4)
     assert rgba[4:10, 3:15, 3].eq(255).all()
     assert rgba[4:10, 2, 3].eq(128).all()  # columns 4 and 5, of which one is foreground

@@ -9,7 +9,6 @@ import torch
 
 from forewarp.data.batches import Sampler
 from forewarp.data.checks import blind_frames
-from forewarp.data.files import SceneError
 from forewarp.data.films import STORE
 from forewarp.data.images import CACHE, write_image
 from forewarp.data.module import MulticamDataModule
@@ -18,7 +17,7 @@ from forewarp.data.rigs import held_cameras
 from forewarp.scene.box import Box
 from forewarp.scene.camera import Camera
 from tests.support.films import numbered, write_film
-from tests.support.written_scenes import fixed_cameras, grey, placed, write_multicam
+from tests.support.written_scenes import fixed_cameras, grey, placed, refused, write_multicam
 
 CAMERAS = fixed_cameras(3)
 
@@ -110,9 +109,8 @@ def test_folders_of_frames_go_before_films_and_may_be_smaller(frames, tmp_path):
 
 def test_cameras_and_moments_are_held_out_by_name_and_told_apart(frames):
     scene = read_scene(frames, "toy", test_cameras=["cam02"], test_moments=[1, 4], test_every=2)
-    kinds = {
-        kind: [f.name for f in scene.test if f.ability == kind] for kind in ("space", "time", "space_time")
-    }
+    abilities = ("space", "time", "space_time")
+    kinds = {kind: [f.name for f in scene.test if f.ability == kind] for kind in abilities}
     assert kinds == {
         "space": ["cam02/0000", "cam02/0002"],
         "time": ["cam00/0001", "cam01/0001", "cam00/0004", "cam01/0004"],
@@ -184,25 +182,16 @@ def set_to(row, column, value):
 
 
 BAD = [
-    (
-        rows(lambda a: a[:2]),
-        rf"{FILE}: expected a row for each of 3 cameras, cam00 to cam02, but got 2 rows; rem",
-    ),
+    (rows(lambda a: a[:2]), rf"{FILE}: expected a row for each of 3 cameras, cam00 to cam02, but got 2 rows"),
     (rows(lambda a: a[:, :15]), r"npy: expected 17 numbers for each camera, but got shape \(3, 15\)"),
-    (
-        lambda folder: (folder / FILE).write_bytes(b"text"),
-        "npy: expected a NumPy file, but got one that cannot",
-    ),
+    (lambda folder: (folder / FILE).write_bytes(b"text"), "npy: expected a NumPy file, but got one that"),
     (set_to(1, 3, np.nan), r"row 1 \(cam01\): expected 4 x 4 or 3 x 4 finite numbers"),
     (set_to(1, 0, 3), r"row 1 \(cam01\): expected a rotation"),
     (set_to(2, 14, 0), r"row 2 \(cam02\): focal length: expected a number in \[0.48, 4800\], but got 0"),
     (set_to(2, 9, 48.5), r"row 2 \(cam02\): height and width: expected whole numbers, but got 32 and 48.5"),
     (set_to(2, 16, 3), r"row 2 \(cam02\): bounds: expected 0 < near < far, but got 14 and 3"),
     (set_to(2, 9, 50), "cam02: expected 50 x 32 or 25 x 16 pixels as .* say, but got 48 x 32"),
-    (
-        lambda folder: [shutil.rmtree(place) for place in folder.glob("cam*")],
-        "expected a video for each camera",
-    ),
+    (lambda folder: [shutil.rmtree(place) for place in folder.glob("cam*")], "a video for each camera"),
     (written("cam01/0003.png", (16, 24)), "0003.png: expected 48 x 32 pixels as the first, but got 24 x 16"),
     (
         lambda folder: (folder / "cam01" / "0003.png").rename(folder / "cam01" / "0013.png"),
@@ -214,7 +203,7 @@ BAD = [
 @pytest.mark.parametrize(("harm", "match"), BAD)
 def test_a_harmed_rig_is_refused_in_a_line(folder, harm, match):
     harm(folder)
-    with pytest.raises(SceneError, match=match) as caught:
+    with refused(match) as caught:
         read_scene(folder.parent, "toy")
     assert "\n" not in str(caught.value)
     assert str(folder) in str(caught.value)
@@ -226,16 +215,10 @@ def test_a_harmed_rig_is_refused_in_a_line(folder, harm, match):
         ({"scale": 3}, "data.scale: expected a divisor of both sides of 48 x 32 pixels, but got 3"),
         ({"scale": 0}, "data.scale: expected a whole number of at least 1, but got 0"),
         ({"frames": 0}, "data.frames: expected a whole number of at least 1, but got 0"),
-        (
-            {"test_cameras": ["cam07"]},
-            r"data.test_cameras: expected some of .* cam00, cam01, cam02, not all, but got no camera cam07",
-        ),
+        ({"test_cameras": ["cam07"]}, r"some of .* cam00, cam01, cam02, not all, but got no camera cam07"),
         ({"test_cameras": "cam00"}, "data.test_cameras: expected some of the cameras"),
         ({"test_cameras": ["cam00", "cam01", "cam02"]}, "data.test_cameras: expected some of the cameras"),
-        (
-            {"test_cameras": []},
-            "expected a camera or a moment to test on, but got none; name some in data.test",
-        ),
+        ({"test_cameras": []}, "expected a camera or a moment to test on, but got none; name some in"),
         ({"test_moments": [6]}, r"data.test_moments: expected numbers of 0 to 5, not all, but got \[6\]"),
         ({"test_moments": [0, 1, 2, 3, 4, 5]}, "data.test_moments: expected numbers"),
         ({"near": 20, "far": 3}, "expected near < far, but got 20 and 3"),
@@ -244,7 +227,7 @@ def test_a_harmed_rig_is_refused_in_a_line(folder, harm, match):
     ],
 )
 def test_bad_options_are_refused_in_a_line(frames, options, match):
-    with pytest.raises(SceneError, match=match):
+    with refused(match):
         read_scene(frames, "toy", **options)
 
 
@@ -255,14 +238,12 @@ def test_poses_in_other_axes_are_named(tmp_path):
         write_image(tmp_path / "toy" / f"cam{k:02d}" / "0.png", grey(camera, 0, k))
     blocks = [np.c_[c.camera_to_world[:3].numpy(), [c.height, c.width, c.fx]].flatten() for c in cameras]
     np.save(tmp_path / "toy" / FILE, np.c_[np.array(blocks), [[14.0, 30.0]] * 4])
-    with pytest.raises(SceneError, match="look at one thing only if the axes are OpenCV's; convert them"):
+    with refused("look at one thing only if the axes are OpenCV's; convert them"):
         read_scene(tmp_path, "toy")
 
 
 def test_names_of_many_cameras_are_shortened():
-    with pytest.raises(
-        SceneError, match="some of the cameras cam00, cam01 .. cam19, not all, but got no camera x"
-    ):
+    with refused("some of the cameras cam00, cam01 .. cam19, not all, but got no camera x"):
         held_cameras(["x"], [f"cam{k:02d}" for k in range(20)], [])
 
 
@@ -270,17 +251,14 @@ def test_names_of_many_cameras_are_shortened():
 def test_films_of_two_rates_or_none_at_all_are_refused(films, tmp_path):
     folder = shutil.copytree(films / "toy", tmp_path / "toy")
     write_film(folder / "cam01.mp4", numbered(6, (32, 48)), stamps="N*40")
-    match = (
-        "cam01.mp4: expected frames at the times of cam00.mp4, 30 a second, but got 25 a second, 0.02 s apart"
-    )
-    with pytest.raises(SceneError, match=match):
+    with refused("cam01.mp4: expected .* of cam00.mp4, 30 a second, but got 25 a second, 0.02 s apart"):
         read_scene(tmp_path, "toy")
     (folder / "cam01.mp4").write_bytes(b"text")
-    with pytest.raises(SceneError, match="cam01.mp4: expected a video, but got another file; copy it again"):
+    with refused("cam01.mp4: expected a video, but got another file; copy it again"):
         read_scene(tmp_path, "toy")
 
 
 @pytest.mark.parametrize("change", [{"fy": 1.0}, {"cx": 3.0}])
 def test_cameras_that_the_layout_cannot_tell_are_not_written(tmp_path, change):
-    with pytest.raises(SceneError, match="camera 0: expected square pixels, the principal point"):
+    with refused("camera 0: expected square pixels, the principal point"):
         write_poses(tmp_path, [replace(CAMERAS[0], **change)], near=1, far=2)

@@ -7,12 +7,21 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from forewarp.data.cameras import FLIP
-from forewarp.data.files import SceneError
-from forewarp.data.images import write_image
 from forewarp.data.nhr import read_scene
-from tests.support.written_scenes import BALLS, COLORS, STEP, dome, dome_frames, dome_truth, place, write_dome
+from tests.support.written_scenes import (
+    BALLS,
+    COLORS,
+    STEP,
+    dome,
+    dome_frames,
+    dome_truth,
+    place,
+    refused,
+    write_dome,
+)
 
 KEYS = ("width", "height", "fx", "fy", "cx", "cy", "skew")
 
@@ -40,9 +49,8 @@ def test_round_trip(written):
         for k, camera in enumerate(dome()):
             frame = frames[f"{f}/img_{k:04d}"]
             assert (frame.time, frame.ability) == (f / 2, "all" if k else "space")
-            torch.testing.assert_close(
-                frame.camera.camera_to_world, camera.camera_to_world, atol=1e-6, rtol=0
-            )
+            pose = frame.camera.camera_to_world
+            torch.testing.assert_close(pose, camera.camera_to_world, atol=1e-6, rtol=0)
             assert [getattr(frame.camera, key) for key in KEYS] == [getattr(camera, key) for key in KEYS]
             rgba, mask = frame.load().numpy(), moment.masks[k]
             assert np.array_equal(rgba[..., 3], mask)
@@ -142,14 +150,14 @@ INTRINSICS = {
 
 @pytest.mark.parametrize("case", INTRINSICS)
 def test_intrinsics_by_others(toy, case):
-    expected = [f.camera for f in read_scene(toy.parent, "toy", half_resolution=False).train]
-    path = toy / "Intrinsic.inf"
+    def intrinsics():
+        scene = read_scene(toy.parent, "toy", half_resolution=False)
+        return [[getattr(frame.camera, key) for key in KEYS] for frame in scene.train]
+
+    expected, path = intrinsics(), toy / "Intrinsic.inf"
     text = INTRINSICS[case](path.read_text())
     path.write_bytes(text if isinstance(text, bytes) else text.encode())
-    cameras = [f.camera for f in read_scene(toy.parent, "toy", half_resolution=False).train]
-    assert [[getattr(c, k) for k in KEYS] for c in cameras] == [
-        [getattr(c, k) for k in KEYS] for c in expected
-    ]
+    assert intrinsics() == expected
 
 
 def test_files_by_others(toy):
@@ -157,7 +165,7 @@ def test_files_by_others(toy):
     poses = "\ufeff\n" + (toy / "CamPose.inf").read_text().replace(" ", "\t ") + "\n\n"
     (toy / "CamPose.inf").write_text(poses, encoding="utf-8")
     grey = np.array([[[127] * 3, [128] * 3]], np.uint8).repeat(24, 0).repeat(30, 1).repeat(2, 0)
-    write_image(toy / "img" / "0" / "mask" / "img_0000.jpg", grey, quality=100)
+    Image.fromarray(grey).save(toy / "img" / "0" / "mask" / "img_0000.jpg", quality=100)
     cloud = toy / "pointclouds" / "frame2.npy"
     rows = [" ".join(map(str, row)) for row in np.load(cloud).tolist()]
     cloud.with_suffix(".obj").write_text("# points\n" + "".join(f"v {row}\n" for row in rows))
@@ -201,21 +209,15 @@ def _columns(order):
         (lambda pose: _columns([2, 0, 1, 3])(pose @ FLIP), "only if the axes are OpenGL's; convert them"),
         (lambda pose: _columns([2, 0, 1, 3])(np.linalg.inv(pose)), "only if they are world-to-camera; conv"),
         (_columns([0, 1, 2, 3]), "only if the columns are x, y, z, centre; convert them"),
-        (
-            lambda pose: _columns([0, 1, 2, 3])(pose @ FLIP),
-            "x, y, z, centre and the axes are OpenGL's; convert them",
-        ),
-        (
-            lambda pose: pose[:3],
-            "line 1: expected columns z, x, y, centre .*, but got its rows; write the col",
-        ),
+        (lambda pose: _columns([0, 1, 2, 3])(pose @ FLIP), "x, y, z, centre and the axes are OpenGL's"),
+        (lambda pose: pose[:3], "line 1: expected columns z, x, y, centre .*, but got its rows; write the"),
     ],
 )
 def test_poses_written_in_another_way_are_named(tmp_path, written_as, said):
     folder = write_dome(tmp_path / "toy", dome(8), 1)
     lines = [written_as(camera.camera_to_world.numpy()).flatten().tolist() for camera in dome(8)]
     (folder / "CamPose.inf").write_text("\n".join(" ".join(map(repr, line)) for line in lines))
-    with pytest.raises(SceneError, match=f"CamPose.inf: .*{said}"):
+    with refused(f"CamPose.inf: .*{said}"):
         read_scene(tmp_path, "toy")
 
 
@@ -225,12 +227,10 @@ def test_poses_written_in_another_way_are_named(tmp_path, written_as, said):
 )
 @pytest.mark.parametrize("half", [False, True])
 def test_intrinsics_of_images_of_another_size_are_named(toy, factor, said, half):
-    blocks = [
-        f"{k} {factor * c.fx} {factor * c.skew} {factor * c.cx} 0 {factor * c.fy} {factor * c.cy} 0 0 1"
-        for k, c in enumerate(dome())
-    ]
+    scaled = [[factor * n for n in (c.fx, c.skew, c.cx, 0, c.fy, c.cy)] for c in dome()]
+    blocks = [" ".join(map(str, [k, *row, 0, 0, 1])) for k, row in enumerate(scaled)]
     (toy / "Intrinsic.inf").write_text("\n".join(blocks))
-    with pytest.raises(SceneError, match=f"Intrinsic.inf: camera 0: expected a principal point .*{said}"):
+    with refused(f"Intrinsic.inf: camera 0: expected a principal point .*{said}"):
         read_scene(toy.parent, "toy", half_resolution=half)
 
 
@@ -250,7 +250,7 @@ def test_clouds_of_other_frames_are_not_taken(toy):
         (toy / "img" / str(f)).rename(toy / "img" / str(f + 8))
     for number in (4, 5, 6, 7, 8, 9, 11):
         shutil.copy(toy / "pointclouds" / "frame1.npy", toy / "pointclouds" / f"frame{number}.npy")
-    with pytest.raises(SceneError, match=r"frame10\.npy: expected"):
+    with refused(r"frame10\.npy: expected"):
         read_scene(toy.parent, "toy")
 
 
@@ -266,18 +266,18 @@ def test_clouds_that_are_counted_from_0_are_taken_in_order(toy):
 
 def test_two_folders_of_one_number_are_named(toy):
     shutil.copytree(toy / "img" / "2", toy / "img" / "002")
-    with pytest.raises(SceneError, match=r"got 002 and 2; remove one"):
+    with refused(r"got 002 and 2; remove one"):
         read_scene(toy.parent, "toy")
 
 
 def test_masks_of_another_kind_are_named(toy):
     mask = toy / "img" / "0" / "mask" / "img_0000.jpg"
     mask.rename(mask.with_suffix(".png"))
-    with pytest.raises(SceneError, match=r"img_0000.png: expected .*, but got another; write JPEG, \.jpg"):
+    with refused(r"img_0000.png: expected .*, but got another; write JPEG, \.jpg"):
         read_scene(toy.parent, "toy")
 
 
 def test_an_image_that_is_missing_in_the_first_frame_is_named(toy):
     (toy / "img" / "0" / "img_0000.jpg").unlink()
-    with pytest.raises(SceneError, match=r"0/img_0000\.jpg: expected"):
+    with refused(r"0/img_0000\.jpg: expected"):
         read_scene(toy.parent, "toy")

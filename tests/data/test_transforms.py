@@ -12,17 +12,10 @@ import torch
 from forewarp.data import dnerf, posed_video
 from forewarp.data.cameras import FLIP
 from forewarp.data.checks import check_seen
-from forewarp.data.files import Entry, SceneError, layout_of
+from forewarp.data.files import Entry, layout_of
 from forewarp.data.module import DNeRFDataModule
-from forewarp.data.transforms import (
-    camera_of,
-    check_times,
-    left_aside,
-    pose_in,
-    times_of,
-    with_intrinsics,
-)
-from tests.support.written_scenes import around, dnerf_shots, edit, write_dnerf
+from forewarp.data.transforms import camera_of, check_times, left_aside, pose_in, times_of, with_intrinsics
+from tests.support.written_scenes import around, dnerf_shots, edit, refused, write_dnerf
 
 EYE = torch.eye(4, dtype=torch.float64)
 WIDE = 2 * math.atan(0.5)  # of images as wide as their focal length
@@ -77,9 +70,7 @@ def test_a_matrix_of_intrinsics_is_read_or_told(own, common, focal, told):
 def test_axes_of_mitsuba_are_named():
     pose = {"transform_matrix": np.eye(4).tolist()}
     assert pose_in(Entry("t.json", pose, common={"from_mitsuba": False}), None, False).shape == (4, 4)
-    with pytest.raises(
-        SceneError, match="from_mitsuba: expected poses in OpenGL's axes.*negate the first and"
-    ):
+    with refused("from_mitsuba: expected poses in OpenGL's axes.*negate the first and"):
         pose_in(Entry("t.json", pose, common={"from_mitsuba": True}), None, False)
 
 
@@ -98,27 +89,18 @@ def test_an_angle_of_upright_images_is_of_the_width_or_as_told():
         ({"fl_x": 80, "is_fisheye": True}, "is_fisheye: expected a pinhole camera"),
         ({"fl_x": 160, "cx": 80, "cy": 60, "w": 80, "h": 60}, r"cx: expected .* images 2 times as large"),
         ({"fl_x": 80, "k5": 0.1}, "k5: expected 0, but got 0.1; undistort"),
-        (
-            {"fl_x": 80, "distortion_params": [0.1, 0, 0, 0, 0, 0]},
-            "distortion_params: expected a lens as k1 k2",
-        ),
+        ({"fl_x": 80, "distortion_params": [0.1, 0, 0, 0, 0, 0]}, "params: expected a lens as k1 k2"),
         ({}, "expected fl_x or camera_angle_x, but got neither"),
         ({"camera_angle_y": 0.0}, r"camera_angle_y: expected radians inside \(0, pi\)"),
-        (
-            {"fl_x": 80, "lens_model": "OPENCV_FISHEYE"},
-            "lens_model: expected a pinhole camera, .*; undistort",
-        ),
-        (
-            {"fl_x": 80, "common": {"camera_type": "PANO"}},
-            r"json: camera_type: .*pinhole camera, but got 'PANO'",
-        ),
+        ({"fl_x": 80, "lens_model": "OPENCV_FISHEYE"}, "lens_model: expected a pinhole camera"),
+        ({"fl_x": 80, "common": {"camera_type": "PANO"}}, r"camera_type: .*pinhole camera, but got 'PANO'"),
         ({"fl_x": 80, "type": "equirectangular"}, r"\.type: expected a pinhole camera"),
         ({"fl_x": 80, "projection": "ORTHO"}, "projection: expected a pinhole camera"),
         ({"fl_x": 80, "fisheye": True}, "fisheye: expected a pinhole camera"),
     ],
 )
 def test_intrinsics_that_cannot_be_right_are_named(keys, said):
-    with pytest.raises(SceneError, match=said):
+    with refused(said):
         camera(**keys)
 
 
@@ -127,9 +109,7 @@ def test_a_vertical_angle_that_contradicts_is_told(angle, said, tmp_path):
     entry = Entry("t.json", {"fl_x": 80, "camera_angle_y": angle})
     lines = left_aside([(entry, camera(**entry.own))])
     assert len(lines) == said
-    assert all(
-        "camera_angle_y: 53.1 degrees left aside, as the other keys say 41.1" in line for line in lines
-    )
+    assert all("_y: 53.1 degrees left aside, as the other keys say 41.1" in line for line in lines)
 
 
 @pytest.mark.parametrize("angle", [41.0, "41", True, [1], 0, 10**400])
@@ -165,9 +145,8 @@ def test_times_that_a_file_does_not_tell_are_in_the_names(names, times):
     assert times_of(names, times, "t.json") == (times, None)
     same, line = times_of(names, [7] * len(names), "t.json")
     assert (same, line) == ([0] * len(names), "t.json: all times lie from 7 to 7: taken as one moment")
-    assert (
-        "all times lie from 0.1 to 0.102" in times_of(names, [0.1, *[0.102] * (len(names) - 1)], "t.json")[1]
-    )
+    _, line = times_of(names, [0.1, *[0.102] * (len(names) - 1)], "t.json")
+    assert "all times lie from 0.1 to 0.102" in line
 
 
 def test_splits_that_disagree_or_overlap_are_named(tmp_path):
@@ -179,22 +158,21 @@ def test_splits_that_disagree_or_overlap_are_named(tmp_path):
     assert line.startswith(f"{folder}: 4 test images are trained on, too")
     twice = test | {"frames": [*test["frames"], test["frames"][0]]}
     (folder / "transforms_test.json").write_text(json.dumps(twice))
-    with pytest.raises(SceneError, match="test: expected each image once, but got r_0.png twice"):
+    with refused("test: expected each image once, but got r_0.png twice"):
         dnerf.read_scene(tmp_path, "toy")
     for frame, pose in zip(test["frames"], around(5)):  # OpenCV's axes
         frame["transform_matrix"] = pose.tolist()
     (folder / "transforms_test.json").write_text(json.dumps(test))
     as_in = "{} images: .* look away from one point; write them as in transforms_{}.json"
-    with pytest.raises(SceneError, match=as_in.format("test", "train")):
+    with refused(as_in.format("test", "train")):
         dnerf.read_scene(tmp_path, "toy")
     for frame, pose in zip(test["frames"], around(5)):
         frame["transform_matrix"] = (pose @ torch.from_numpy(FLIP)).tolist()
-    train["frames"] = [
-        {**frame, "transform_matrix": pose.tolist()} for frame, pose in zip(train["frames"], around(7))
-    ]
+    for frame, pose in zip(train["frames"], around(7)):
+        frame["transform_matrix"] = pose.tolist()
     for file, content in zip(files, (test, train)):
         file.write_text(json.dumps(content))
-    with pytest.raises(SceneError, match=as_in.format("train", "test")):
+    with refused(as_in.format("train", "test")):
         dnerf.read_scene(tmp_path, "toy")
 
 
@@ -242,33 +220,17 @@ def test_times_that_miss_0_and_1_by_rounding_are_not_scaled():
 @pytest.mark.parametrize(
     ("train", "test", "said"),
     [
-        (
-            [0, 0.5, 33.3, 0.7],
-            [1],
-            r"t.json: time of train/2: expected a time near all others, 0 to 1, .* 33.3;",
-        ),
-        (
-            [0, *(1000 + i for i in range(19))],
-            [1000.5],
-            "time of train/0: expected .* 1000 to 101., but got 0",
-        ),
+        ([0, 0.5, 33.3, 0.7], [1], r"time of train/2: expected a time near all others, 0 to 1, .* 33.3;"),
+        ([0, *(1000 + i for i in range(19))], [1000.5], "time of train/0: expected .* 1000 to 101., .* 0;"),
         ([i / 18 for i in range(19)], [44.0, 55.0], "time of test/1: expected .* 0 to 1, but got 55"),
-        (
-            [0, 0.5, 1],
-            [0, 50, 100],
-            r"times of train frames: expected one .* 0 to 100, .* 0 to 1 \(train/0, ..",
-        ),
+        ([0, 0.5, 1], [0, 50, 100], r"times of train frames: expected one .* 0 to 100, .* 0 to 1 \(train/0"),
         ([0, 50, 100], [0, 0.5, 1], "times of test frames: expected one unit .* write all times in one unit"),
-        (
-            [i / 9 for i in range(10)],
-            range(16),
-            r"times of train frames: expected one unit .* 0 to 15, but got 0 to 1 \(train/0",
-        ),
+        ([i / 9 for i in range(10)], range(16), r"train frames: expected one unit .* 0 to 15, .* 0 to 1 \("),
     ],
 )
 def test_times_in_two_units_are_refused(train, test, said):
     times = {"train": train, "test": test}
-    with pytest.raises(SceneError, match=said):
+    with refused(said):
         check_times({k: {f"{k}/{i}": t for i, t in enumerate(of)} for k, of in times.items()}, "t.json")
 
 
@@ -294,9 +256,7 @@ def test_times_under_another_key_are_named(tmp_path):
     for file in folder.glob("*.json"):
         edit(file, lambda c: [f.update(timestamp=f.pop("time")) for f in c["frames"]])
     lines = dnerf.read_scene(tmp_path, "toy").protocol["assumed"]
-    assert (
-        f"{folder}/transforms_train.json: timestamp of the frames is not read; call it time, if" in lines[0]
-    )
+    assert f"{folder}/transforms_train.json: timestamp of the frames is not read; call it" in lines[0]
     assert "taken from the numbers in the images' names" in lines[-1]
 
 
@@ -314,30 +274,26 @@ def test_what_is_not_there_is_left_out_and_told(tmp_path):
     (folder / "transforms_test.json").unlink()
     assert len(dnerf.read_scene(tmp_path, "toy").test) == 1
     shutil.rmtree(folder / "train")
-    with pytest.raises(
-        SceneError, match="expected the images that it lists, as .*r_0.png, but got none of them"
-    ):
+    with refused("expected the images that it lists, as .*r_0.png, but got none of them"):
         dnerf.read_scene(tmp_path, "toy")
 
 
 def moved(folder, shift, factor):
-    for file in folder.glob("transforms_*.json"):
-        content = json.loads(file.read_text())
+    def change(content):
         for frame in content["frames"]:
             for row, by in zip(frame["transform_matrix"], shift):
                 row[3] = factor * row[3] + by
-        file.write_text(json.dumps(content))
+
+    for file in folder.glob("transforms_*.json"):
+        edit(file, change)
 
 
 @pytest.mark.parametrize(
-    ("shift", "factor"), [((7, -3, 1), 1), ((0, 0, 0), 3.5), ((0, 0, 0), 1e6), ((0, 0, 0), 1e-6)]
+    ("shift", "factor"), [((7, -3, 1), 1), *(((0, 0, 0), by) for by in (3.5, 1e6, 1e-6))]
 )
 def test_a_scene_of_other_units_is_moved_to_where_the_published_ones_are(shift, factor, tmp_path):
-    folder = tmp_path / "toy"
-    poses = around(12)
-    shots = [
-        dnerf.Shot(f"r_{i}", i / 11, pose, np.full((8, 8, 4), 200, np.uint8)) for i, pose in enumerate(poses)
-    ]
+    folder, grey = tmp_path / "toy", np.full((8, 8, 4), 200, np.uint8)
+    shots = [dnerf.Shot(f"r_{i}", i / 11, pose, grey) for i, pose in enumerate(around(12))]
     dnerf.write_scene(folder, {"train": shots, "test": shots[:2]}, camera_angle_x=0.7)
     as_is = dnerf.read_scene(tmp_path, "toy", box="auto")
     assert (as_is.train[0].camera.near, as_is.train[0].camera.far) == (2, 6)
@@ -348,7 +304,7 @@ def test_a_scene_of_other_units_is_moved_to_where_the_published_ones_are(shift, 
     distances = [float(frame.camera.center.norm()) for frame in scene.train]
     assert distances == pytest.approx([4.0] * 12, rel=1e-4)
     assert max(map(abs, (*scene.box.low, *scene.box.high))) < 8
-    with pytest.raises(SceneError, match=r"expected a box that cameras see .*cameras look at \("):
+    with refused(r"expected a box that cameras see .*cameras look at \("):
         _ = DNeRFDataModule(tmp_path, "toy", box=[v * factor for v in (30, 30, 30, 31, 31, 31)]).scene
 
 
@@ -357,7 +313,7 @@ def test_images_with_and_without_alpha_are_not_mixed(tmp_path):
 
     write_dnerf(tmp_path / "toy")
     write_image(tmp_path / "toy" / "train" / "r_2.png", np.zeros((6, 8, 3), np.uint8))
-    with pytest.raises(SceneError, match=r"in all images or in none, but got 1 of 9 without, as .*r_2.png"):
+    with refused(r"in all images or in none, but got 1 of 9 without, as .*r_2.png"):
         dnerf.read_scene(tmp_path, "toy")
 
 
@@ -380,12 +336,10 @@ def test_a_missing_image_of_nearly_that_name_is_named(there, said, tmp_path):
 def test_a_missing_folder_of_nearly_that_name_is_named(tmp_path):
     folder = write_dnerf(tmp_path / "toy")
     (folder / "train").rename(folder / "Train")
-    with pytest.raises(SceneError, match="got none of them; toy/Train is there"):
+    with refused("got none of them; toy/Train is there"):
         dnerf.read_scene(tmp_path, "toy")
     (folder / "transforms_train.json").rename(folder / "Transforms_Train.json")
-    with pytest.raises(
-        SceneError, match="with transforms_train.json, but got none; toy/Transforms_Train.json is"
-    ):
+    with refused("with transforms_train.json, but got none; toy/Transforms_Train.json is"):
         dnerf.read_scene(tmp_path, "toy")
 
 
@@ -396,9 +350,7 @@ def test_files_of_other_encodings_are_read_or_named(encoding, tmp_path):
     file.write_bytes(text.encode(encoding))
     assert len(dnerf.read_scene(tmp_path, "toy").train) == 4
     file.write_bytes(text.encode("latin-1"))
-    with pytest.raises(
-        SceneError, match="train.json: line 2: expected text in UTF-8, .* 0xe9, as of Latin-1; sav"
-    ):
+    with refused("train.json: line 2: expected text in UTF-8, .* 0xe9, as of Latin-1; sav"):
         dnerf.read_scene(tmp_path, "toy")
 
 
@@ -414,5 +366,5 @@ def test_files_of_windows_and_images_of_any_suffix(tmp_path):
 def test_another_layout_is_named(tmp_path):
     write_dnerf(tmp_path / "toy")
     assert layout_of(tmp_path / "toy") == "D-NeRF"
-    with pytest.raises(SceneError, match="this is a scene in the layout of D-NeRF: use experiment=dnerf"):
+    with refused("this is a scene in the layout of D-NeRF: use experiment=dnerf"):
         posed_video.read_scene(tmp_path, "toy")

@@ -41,19 +41,8 @@ def test_what_is_no_video_has_no_frames(tmp_path):
 def test_frames_that_were_cut_off_without_coding_anew_have_no_time(tmp_path):
     """They lie before the first frame that is shown, on which it depends."""
     film, cut = write_film(tmp_path / "a.mp4", numbered(12)), tmp_path / "cut.mp4"
-    call = [
-        imageio_ffmpeg.get_ffmpeg_exe(),
-        "-v",
-        "error",
-        "-ss",
-        "0.2",
-        "-i",
-        str(film),
-        "-c",
-        "copy",
-        str(cut),
-    ]
-    subprocess.run(call, check=True)
+    options = ["-v", "error", "-ss", "0.2", "-i", str(film), "-c", "copy", str(cut)]
+    subprocess.run([imageio_ffmpeg.get_ffmpeg_exe(), *options], check=True)
     np.testing.assert_allclose(stamps_of(cut), 0.04 * np.arange(7), atol=1e-6)
     shown = list(extracted(cut, None, None))
     assert len(shown) == 7

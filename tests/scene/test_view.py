@@ -18,9 +18,8 @@ def test_smaller_images_are_means_by_alpha_valid_where_all_is_and_as_deep_as_the
     valid = torch.ones(4, 5, dtype=torch.bool)
     valid[0, 4] = False
     sensed = torch.arange(40.0).reshape(2, 4, 5)
-    whole = Observation(
-        Moment(0.5, 3), View(camera), rgb.reshape(-1, 4), torch.ones(3), valid.flatten(), sensed.flatten(1)
-    )
+    beside = valid.flatten(), sensed.flatten(1)
+    whole = Observation(Moment(0.5, 3), View(camera), rgb.reshape(-1, 4), torch.ones(3), *beside)
     small = whole.smaller(2)
     assert (small.moment, small.view.shape) == (whole.moment, (2, 2))
     assert small.view.camera.fx == 8.0 * 2 / 5

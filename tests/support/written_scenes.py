@@ -13,6 +13,7 @@ import pytest
 import torch
 
 from forewarp.data import dnerf, hypernerf, multicam, nhr, posed_video
+from forewarp.data.files import SceneError
 from forewarp.drawing import images
 from forewarp.scene.camera import Camera, Lens, look_at
 from forewarp.scene.frame import Truth
@@ -28,6 +29,11 @@ def real(folder: str) -> Path:
     if not (_REAL / folder).is_dir():
         pytest.skip(f"no real data: {_REAL / folder} is absent; set FOREWARP_DATA")
     return _REAL / folder
+
+
+def refused(match):
+    """What a user gave is refused in a line like this."""
+    return pytest.raises(SceneError, match=match)
 
 
 def edit(path, change):

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from forewarp.data.cameras import MOST_UNITS
-from forewarp.data.files import mismatch, numbers_of, opened
+from forewarp.data.files import mismatch, numbers_of, opened, read_bytes
 from forewarp.data.images import read_gray16
 from forewarp.files import MOST_ARRAYS, MOST_POINTS, written_whole
 from forewarp.ops.grid import reduced_depth
@@ -27,9 +27,7 @@ class StoredDepth:
     ``size`` (width, height) is what the file must hold; with ``halve`` half of that is given.
     """
 
-    def __init__(
-        self, path: Path, size: tuple[int, int], halve: bool = False, scale: float | None = None
-    ) -> None:
+    def __init__(self, path: Path, size: tuple[int, int], halve: bool, scale: float | None) -> None:
         if path.suffix == ".png" and scale is None:
             expected = "depth_scale in the transforms file, world units for one step of a 16-bit depth"
             raise mismatch(path, expected, "none")
@@ -117,17 +115,13 @@ _PLY_TYPES = {
 
 def _ply_places(path: Path) -> np.ndarray:
     """Read the places (N, 3) of a PLY's vertices, text or binary, which must be its first element."""
-    with opened(path, MOST_POINTS) as stream:
-        head, _, body = stream.read().partition(b"end_header")
+    head, _, body = read_bytes(path, MOST_POINTS).partition(b"end_header")
     lines = [line.split() for line in head.decode("latin1").splitlines()]
     order = next((_PLY_ORDERS.get(line[1]) for line in lines if line[:1] == ["format"] and line[1:]), None)
     starts = [i for i, line in enumerate(lines) if line[:1] == ["element"]]
     vertices = lines[starts[0] : (*starts, None)[1]] if starts else [[]]
-    columns = [
-        (line[-1], _PLY_TYPES.get(line[1]))
-        for line in vertices[1:]
-        if line[:1] == ["property"] and len(line) > 2
-    ]
+    properties = [line for line in vertices[1:] if line[:1] == ["property"] and len(line) > 2]
+    columns = [(line[-1], _PLY_TYPES.get(line[1])) for line in properties]
     is_read = vertices[0][1:2] == ["vertex"] and vertices[0][-1].isdecimal() and order is not None
     if not head.startswith(b"ply") or not is_read or not {"x", "y", "z"} <= dict(columns).keys():
         raise mismatch(path, "a PLY whose first element is vertices with x, y, z", "another file")
@@ -194,10 +188,7 @@ def _numbers(array: object, where: str) -> np.ndarray:
 
 
 def _obj_vertices(path: Path, columns: int) -> np.ndarray:
-    with opened(path, MOST_POINTS) as stream:
-        lines = stream.read().decode(errors="replace").splitlines()
-    vertices = [
-        (i, line.split()[1:]) for i, line in enumerate(lines, 1) if line.split(maxsplit=1)[:1] == ["v"]
-    ]
-    rows = [numbers_of(words, columns, f"{path}: line {i}") for i, words in vertices]
+    lines = read_bytes(path, MOST_POINTS).decode(errors="replace").splitlines()
+    words = {i: line.split() for i, line in enumerate(lines, 1)}
+    rows = [numbers_of(row[1:], columns, f"{path}: line {i}") for i, row in words.items() if row[:1] == ["v"]]
     return np.array(rows).reshape(-1, columns)

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from torch.utils.data import IterableDataset
 
-from forewarp.data.files import mismatch
+from forewarp.data.files import mismatch, one_of
 from forewarp.data.images import StoredImage, composited, reduced
 from forewarp.ops.grid import block_means, reduced_depth
 from forewarp.scene.frame import Frame, Scene, instants_of
@@ -20,8 +20,7 @@ COLORS = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}
 
 def color_of(background: str) -> Tensor:
     """Look up the background colour (3,) white or black."""
-    if background not in COLORS:
-        raise mismatch("data.eval_background", "white or black", repr(background))
+    one_of(background, "data.eval_background", *COLORS)
     return torch.tensor(COLORS[background])
 
 
@@ -64,17 +63,14 @@ class Sampler(IterableDataset):
         views_per_step: int = 1,
         asks: Asks | None = None,
     ) -> None:
-        if rays is not None and int(rays) < 1:
-            raise mismatch("data.rays", "at least 1", rays)
-        if background not in (*COLORS, "random"):
-            raise mismatch("data.background", "white, black or random", repr(background))
-        if int(views_per_step) < 1:
-            raise mismatch("data.views_per_step", "at least 1", views_per_step)
+        one_of(background, "data.background", *COLORS, "random")
+        for key, count in (("rays", rays), ("views_per_step", views_per_step)):
+            if count is not None and int(count) < 1:
+                raise mismatch(f"data.{key}", "at least 1", count)
         self.frames, self.background, self.picker, self.asks = scene.train, background, picker, asks or Asks()
         self.rays = None if rays is None else int(rays)
         self.views_per_step = min(int(views_per_step), self.rays or 1)
-        self._of_time: dict[float, list[int]] = {}  # time -> frames
-        self._times = instants_of(scene.train)
+        self._times, self._of_time = instants_of(scene.train), {}  # the latter: time -> frames
         for index, time in enumerate(self._times):
             self._of_time.setdefault(time, []).append(index)
         self.seed, self._generator = seed, torch.Generator().manual_seed(seed)
@@ -127,7 +123,7 @@ class Sampler(IterableDataset):
         frames = frames[: self.rays]  # none without a pixel
         counts = [self.rays // len(frames) + (i < self.rays % len(frames)) for i in range(len(frames))]
         views = []
-        for index, count in zip(frames, counts, strict=True):
+        for index, count in zip(frames, counts):
             frame = self.frames[index]
             allowed = None if frame.load_valid is None else frame.load_valid().flatten().nonzero()[:, 0]
             most = frame.camera.width * frame.camera.height if allowed is None else len(allowed)
@@ -149,18 +145,13 @@ class Sampler(IterableDataset):
             yield self._observed(index, view, self._colors(1)[0])
 
     def _observed(self, index: int, view: View, background: Tensor) -> Observation:
-        frame, rows = self.frames[index], view.indices
-        rgba = pixels_of(frame).reshape(-1, 4)
-        rgba = rgba if rows is None else rgba[rows]
+        frame, rows = self.frames[index], slice(None) if view.indices is None else view.indices
+        rgba, valid, sensed = pixels_of(frame).reshape(-1, 4)[rows], None, None
         rgb = rgba if self.asks.straight else composited(rgba, background)
-        valid = None
         if frame.load_valid is not None and view.pixels is None:
-            valid = frame.load_valid().flatten()
-            valid = valid if rows is None else valid[rows]
-        sensed = None
+            valid = frame.load_valid().flatten()[rows]
         if self.asks.sensed and frame.load_sensed is not None:
-            sensed = frame.load_sensed().flatten(1)
-            sensed = sensed if rows is None else sensed[:, rows]
+            sensed = frame.load_sensed().flatten(1)[:, rows]
         moment = Moment(frame.time, index, frame.camera_id, filmed=True)
         return Observation(moment, view, rgb, background, valid, sensed)
 
@@ -183,9 +174,7 @@ class Targets(Sequence[Target]):
         factor: above 1 averages blocks of so many pixels a side: see ``reduced``.
     """
 
-    def __init__(
-        self, frames: Sequence[Frame], background: Tensor, has_alpha: bool, trained=False, factor: int = 1
-    ) -> None:
+    def __init__(self, frames: Sequence[Frame], background: Tensor, has_alpha: bool, trained=False, factor=1):
         self.frames, self.background, self.has_alpha = frames, background, has_alpha
         self.trained, self.factor = trained, factor
 
@@ -213,17 +202,13 @@ class Targets(Sequence[Target]):
 
     def __getitem__(self, index: int) -> Target:
         frame = self.frames[index]
-        rgba, depth = pixels_of(frame), frame.load_depth() if frame.load_depth else None
-        masks = frame.load_valid, frame.load_moving, frame.load_covisible
-        valid, moving, covisible = (load and load() for load in masks)
-        if self.factor > 1:
-            rgba = reduced(rgba, self.factor)
-            depth = None if depth is None else reduced_depth(depth, self.factor)
-            valid, covisible = (
-                None if mask is None else block_means(mask.float(), self.factor) == 1
-                for mask in (valid, covisible)
-            )
-            moving = None if moving is None else block_means(moving.float(), self.factor) >= 0.5
+        loads = frame.load_depth, frame.load_valid, frame.load_moving, frame.load_covisible
+        rgba, (depth, *masks) = pixels_of(frame), (load and load() for load in loads)
+        if (by := self.factor) > 1:
+            rgba, depth = reduced(rgba, by), None if depth is None else reduced_depth(depth, by)
+            shares = (1, 0.5, 1)  # of a block, at least
+            masks = [m if m is None else block_means(m.float(), by) >= s for m, s in zip(masks, shares)]
+        valid, moving, covisible = masks
         foreground = None if depth is None else depth > 0
         if self.has_alpha:
             foreground = rgba[..., 3] > 127  # at least half covered

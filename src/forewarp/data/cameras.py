@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from forewarp.data.files import mismatch
+from forewarp.data.files import mismatch, number
 from forewarp.scene.box import Box
 from forewarp.scene.camera import Camera, Lens, focus_point
 
@@ -71,6 +71,11 @@ def opengl_rows(pose: np.ndarray | torch.Tensor, where: str) -> list[list[float]
     return (pose_of(np.asarray(pose, np.float64), where) @ FLIP).tolist()
 
 
+def length_of(value: object, where: str) -> float | None:
+    """Check a length in world units that may be unknown, None."""
+    return None if value is None else number(value, where, 0, MOST_UNITS)
+
+
 def box_of(values: Sequence[float]) -> Box:
     """Make the box that a config gives as x0 y0 z0 x1 y1 z1 in world units.
 
@@ -100,8 +105,7 @@ def check_lens(camera: Camera, where: str) -> None:
 
     Cost: nine points of Newton's method, once for all cameras of the same lens and size.
     """
-    shape = camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy, camera.skew
-    if camera.lens is not None and not _can_be_undone(camera.lens, *shape):
+    if camera.lens is not None and not _can_be_undone(*camera.inner):
         got = f"k={camera.lens.k} and p={camera.lens.p}"
         raise mismatch(where, "a lens that can be undone all over the picture", got, "undistort the images")
 
@@ -117,7 +121,7 @@ def check_middle(camera: Camera, where: str) -> None:
     across, down = 2 * camera.cx / camera.width, 2 * camera.cy / camera.height
     of_one_factor = min(across, down) > _LEAST_FACTOR and abs(across / down - 1) < _SAME_FACTOR
     exchanged = 2 * camera.cx / camera.height, 2 * camera.cy / camera.width
-    advice = None
+    aside, advice = min(abs(across - 1), abs(down - 1)), None
     factor = math.sqrt(across * down) if of_one_factor else 1.0
     if 0 < max(camera.cx, camera.cy) <= 1 < min(camera.width, camera.height) / _FEW_PIXELS:
         advice = "they are shares of the size: multiply cx and fl_x by the width, cy and fl_y by the height"
@@ -125,9 +129,7 @@ def check_middle(camera: Camera, where: str) -> None:
         size, way = (factor, "down") if factor > 1 else (1 / factor, "up")
         larger = "large" if factor > 1 else "small"
         advice = f"the intrinsics are of images {size:.3g} times as {larger}: scale them {way}"
-    elif min(abs(across - 1), abs(down - 1)) > _SAME_FACTOR and all(
-        abs(share - 1) < _EXCHANGED for share in exchanged
-    ):
+    elif aside > _SAME_FACTOR and all(abs(share - 1) < _EXCHANGED for share in exchanged):
         advice = "width and height seem exchanged: exchange cx and cy, fl_x and fl_y"
     if advice is not None:
         got = f"({camera.cx:g}, {camera.cy:g}) of {camera.width} x {camera.height} pixels"
@@ -135,13 +137,22 @@ def check_middle(camera: Camera, where: str) -> None:
 
 
 @lru_cache(1024)
-def _can_be_undone(lens: Lens, width: int, height: int, *pinhole: float) -> bool:
-    pose = torch.eye(4, dtype=torch.float64)
-    camera = Camera(width, height, *pinhole[:4], pose, 0.0, 0.0, pinhole[4], lens)
+def _can_be_undone(*inner: float | Lens) -> bool:
+    camera = Camera.at_origin(*inner)
     pixels = nine_pixels(camera)
-    u, v = pixels % width + 0.5, torch.div(pixels, width, rounding_mode="floor") + 0.5
+    u, v = pixels % camera.width + 0.5, torch.div(pixels, camera.width, rounding_mode="floor") + 0.5
     again, _ = camera.project(camera.directions(u, v))
     return bool(((again - torch.stack([u, v], -1)).abs() < _SAME_PIXEL).all())
+
+
+def smaller(camera: Camera, scale: int) -> Camera:
+    """Scale a camera to an image whose sides are ``scale`` times smaller; sizes are rounded, all else exact.
+
+    The skew shrinks too. Public loaders leave it as it is, which slants the image wherever it is not 0.
+    """
+    size = {"width": round(camera.width / scale), "height": round(camera.height / scale)}
+    pixels = {key: getattr(camera, key) / scale for key in ("fx", "fy", "cx", "cy", "skew")}
+    return replace(camera, **size, **pixels)
 
 
 def nine_pixels(camera: Camera) -> torch.Tensor:
@@ -162,9 +173,13 @@ class Normalisation:
 
     def points(self, points: np.ndarray | torch.Tensor) -> torch.Tensor:
         """Move points (..., 3) from the file's world to the scene's: float64."""
-        return (
-            torch.as_tensor(points).double() - torch.tensor(self.center, dtype=torch.float64)
-        ) * self.scale
+        center = torch.tensor(self.center, dtype=torch.float64)
+        return (torch.as_tensor(points).double() - center) * self.scale
+
+    @property
+    def told(self) -> dict:
+        """What a scene's protocol says of it."""
+        return {"center": list(self.center), "scale": self.scale}
 
     def camera(self, camera: Camera) -> Camera:
         """Move a camera from the file's world to the scene's."""
@@ -205,9 +220,8 @@ def space_of(
     space = Normalisation(center, 1 / size, near / size, far / size)
 
     def moved(box: Box) -> Box:
-        return Box(
-            *(tuple((v - c) * space.scale for v, c in zip(end, center)) for end in (box.low, box.high))
-        )
+        ends = (tuple((v - c) * space.scale for v, c in zip(end, center)) for end in (box.low, box.high))
+        return Box(*ends)
 
     try:
         if box is not None:
@@ -224,9 +238,7 @@ def space_of(
         raise mismatch(where, "cameras that see a part of space", f"none ({error})", advice) from error
 
 
-def _focus(
-    cameras: Sequence[Camera], near: float | None, far: float | None, where: str
-) -> tuple[Tensor, Tensor]:
+def _focus(cameras: list[Camera], near: float | None, far: float | None, where: str) -> tuple[Tensor, Tensor]:
     """Find the focus (3,) and its distances along the optical axes of the cameras that face it, float64."""
     centers = torch.stack([camera.center for camera in cameras])
     axes = torch.stack([camera.camera_to_world[:3, 2] for camera in cameras])

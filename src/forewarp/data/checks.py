@@ -14,7 +14,7 @@ from forewarp.data.files import mismatch
 from forewarp.data.images import in_order
 from forewarp.scene.box import Box, Lattice
 from forewarp.scene.camera import Camera, focus_point
-from forewarp.scene.frame import Frame, Scene, sightings, spread, walk_of
+from forewarp.scene.frame import Frame, Scene, sightings, spread, walk_of, where_seen
 
 _LOOKED_AT = 8  # training images whose alpha is looked at
 _PIXELS = 4000  # of each
@@ -62,47 +62,36 @@ def remarks(scene: Scene) -> Iterator[str]:
     names = [frame.name for frame in sorted(scene.train, key=lambda frame: frame.time)]
     if names == sorted(names) != (numbered := in_order(names)):
         got, due = next(pair for pair in zip(names, numbered) if pair[0] != pair[1])
-        yield (
-            f"times follow the images' names as texts, not their numbers ({got} comes where {due} is due); "
-            "count them in the order of the numbers"
-        )
-    beyond = [frame.time for frame in scene.test if not scene.times[0] <= frame.time <= scene.times[-1]]
+        line = f"times follow the images' names as texts, not their numbers ({got} comes where {due} is due)"
+        yield f"{line}; count them in the order of the numbers"
+    first, last = scene.times[0], scene.times[-1]
+    beyond = [frame.time for frame in scene.test if not first <= frame.time <= last]
     if scene.test and len(beyond) == len(scene.test):
-        yield (
-            f"all test times, {min(beyond):.4g} to {max(beyond):.4g}, lie outside training's, "
-            f"{scene.times[0]:.4g} to {scene.times[-1]:.4g}, of which alone motion is learnt; give images of "
-            "one moment one time"
-        )
-    if (
-        not aside
-        and (walk := walk_of(scene)) is not None
-        and (walk[0] < _WALKED or (walk[1] or _SLOW) < _SLOW)
-    ):
+        line = f"all test times, {min(beyond):.4g} to {max(beyond):.4g}, lie outside training's"
+        advice = "of which alone motion is learnt; give images of one moment one time"
+        yield f"{line}, {first:.4g} to {last:.4g}, {advice}"
+    walk = None if aside else walk_of(scene)
+    if walk is not None and (walk[0] < _WALKED or (walk[1] or _SLOW) < _SLOW):
         speed = "" if walk[1] is None else f", {walk[1]:.2g} a second"
-        yield (
-            f"the camera goes {walk[0]:.2g} degrees around what it looks at{speed}: hardly more than one "
-            "that stands still, which tells little of depth; other views of what moves will be guesses"
-        )
+        line = f"the camera goes {walk[0]:.2g} degrees around what it looks at{speed}: hardly more than one"
+        line += " that stands still, which tells little of depth"
+        yield f"{line}; other views of what moves will be guesses"
     if scene.has_alpha:
         yield from _silhouettes(scene, bounded=not aside)
     if masked := [frame.load_valid for frame in scene.train if frame.load_valid is not None]:
-        share = sum(float(masked[i]().float().mean()) for i in spread(len(masked), _LOOKED_AT))
-        share /= min(len(masked), _LOOKED_AT)
-        if share < _FEW:
-            yield (
-                f"masks leave {share:.0%} of the pixels to train on; if dark is what lies beside the "
-                "subject, set data.masks=alpha, if it is the subject, invert them"
-            )
+        shares = [float(masked[i]().float().mean()) for i in spread(len(masked), _LOOKED_AT)]
+        if (share := sum(shares) / len(shares)) < _FEW:
+            advice = "if dark is what lies beside the subject, set data.masks=alpha"
+            line = f"masks leave {share:.0%} of the pixels to train on"
+            yield f"{line}; {advice}, if it is the subject, invert them"
     if scene.still is not None:
         cameras = [frame.camera for frame in scene.train]
         images = [torch.ones((), dtype=torch.bool).expand(c.height, c.width) for c in cameras]
         some = scene.still[:: max(1, len(scene.still) // _PIXELS)].double()
         seen = sightings(some, cameras, images)[1]
         if (share := float((seen > 0).double().mean())) < _FEW:
-            yield (
-                f"training cameras see {share:.0%} of the {len(scene.still)} points that never move, as if "
-                "they were in other units or axes; remove them, or write them anew"
-            )
+            line = f"training cameras see {share:.0%} of the {len(scene.still)} points that never move"
+            yield f"{line}, as if they were in other units or axes; remove them, or write them anew"
 
 
 def _pinholes(scene: Scene) -> Iterator[str]:
@@ -116,10 +105,8 @@ def _pinholes(scene: Scene) -> Iterator[str]:
     across = float(torch.tensor([camera.cx / camera.width for camera in cameras]).median())
     down = float(torch.tensor([camera.cy / camera.height for camera in cameras]).median())
     if max(abs(across - 0.5), abs(down - 0.5)) > _ASIDE:
-        yield (
-            f"the principal point lies at {across:.0%} of the width and {down:.0%} of the height, as of "
-            "images that were cropped since; subtract what was cut off from cx and cy"
-        )
+        line = f"the principal point lies at {across:.0%} of the width and {down:.0%} of the height"
+        yield f"{line}, as of images that were cropped since; subtract what was cut off from cx and cy"
     stretched = [frame.camera.fy / frame.camera.fx for frame in scene.train]
     if not 1 / _STRETCHED < (ratio := float(torch.tensor(stretched).median())) < _STRETCHED:
         yield f"pixels are {ratio:.3g} times as wide as high, by their focal lengths; compare both"
@@ -138,10 +125,8 @@ def _too_wide(scene: Scene, aim: Tensor | None) -> Iterator[str]:
     half = min(high - low for low, high in zip(scene.box.low, scene.box.high)) / 2
     if scene.has_alpha and half > _AROUND * ring:
         what = "point clouds were" if scene.protocol.get("dataset") == "nhr" else "it were"
-        yield (
-            f"the box {bounds(scene)} is {half / max(ring, _SAME_PLACE):.3g} times as wide as the ring of "
-            f"all cameras, as if {what} in another unit; {_remedy(scene, 'box')}"
-        )
+        times = f"{half / max(ring, _SAME_PLACE):.3g} times as wide as the ring of all cameras"
+        yield f"the box {bounds(scene)} is {times}, as if {what} in another unit; {_remedy(scene, 'box')}"
 
 
 def _of_test_images(scene: Scene) -> Iterator[str]:
@@ -153,19 +138,16 @@ def _of_test_images(scene: Scene) -> Iterator[str]:
     of_test = [f.camera.fx / max(f.camera.width, f.camera.height) for f in scene.test]
     middle = float(torch.tensor(of_test or focal).median())
     if not min(focal) / _ZOOMED < middle < max(focal) * _ZOOMED:
-        yield (
-            f"the focal length of test images is {middle:.2g} of their longer side and that of training "
-            f"images {min(focal):.2g} to {max(focal):.2g}; compare both"
-        )
+        line = f"the focal length of test images is {middle:.2g} of their longer side and that of training"
+        yield f"{line} images {min(focal):.2g} to {max(focal):.2g}; compare both"
     deep = next((f for f in (*scene.test, *scene.train) if f.load_depth or f.load_sensed), None)
     depth = None if deep is None else deep.load_depth() if deep.load_depth else deep.load_sensed()[0]
     if depth is not None and bool((depth > 0).any()):
         away, near, far = float(depth[depth > 0].median()), deep.camera.near, deep.camera.far
         if not near < away < far:
-            yield (
-                f"{deep.name}: its depth is {_length(scene, away)} in the median, with near at "
-                f"{_length(scene, near)} and far at {_length(scene, far)}; write it in the units of the poses"
-            )
+            depth, near, far = (_length(scene, length) for length in (away, near, far))
+            line = f"{deep.name}: its depth is {depth} in the median, with near at {near} and far at {far}"
+            yield f"{line}; write it in the units of the poses"
 
 
 def _aimed(scene: Scene, aim: Tensor) -> Iterator[str]:
@@ -229,11 +211,9 @@ def _silhouettes(scene: Scene, *, bounded: bool) -> Iterator[str]:
         yield "alpha is opaque in all training images looked at: cut the subject out, or leave alpha out"
     turned = [_is_inverted(mask) for mask in solid]
     if sum(turned) > _FEW * len(frames):
-        yield (
-            f"in {sum(turned)} of {len(frames)} training images looked at the subject fills the edges and "
-            "not the middle, as if alpha or masks were inverted; invert them"
-        )
-        bounded = False  # what is solid is not the subject
+        line = f"in {sum(turned)} of {len(frames)} training images looked at the subject fills the edges and"
+        yield f"{line} not the middle, as if alpha or masks were inverted; invert them"
+        return  # what is solid is not the subject
     if not bounded:
         return
     missed = total = 0
@@ -242,10 +222,8 @@ def _silhouettes(scene: Scene, *, bounded: bool) -> Iterator[str]:
         pixels = pixels[:: max(1, len(pixels) // _PIXELS)]
         missed, total = missed + int((~meets(frame.camera, scene.box, pixels)).sum()), total + len(pixels)
     if missed > _CUT_OFF * total:
-        yield (
-            f"{missed / total:.0%} of the subject's pixels see nothing of the box {bounds(scene)} between "
-            f"near and far; {_remedy(scene, 'all')}"
-        )
+        line = f"{missed / total:.0%} of the subject's pixels see nothing of the box {bounds(scene)}"
+        yield f"{line} between near and far; {_remedy(scene, 'all')}"
 
 
 def _is_inverted(solid: Tensor) -> bool:
@@ -299,11 +277,8 @@ def blind_frames(scene: Scene, frames: Sequence[Frame] | None = None) -> int:
     points = lattice.to_world(lattice.all_voxels()).double()
 
     def sees(camera: Camera) -> bool:
-        pixel, depth = camera.project(points)
-        column, row = pixel.unbind(-1)
-        inside = (depth > 0) & (column >= 0) & (row >= 0) & (column < camera.width) & (row < camera.height)
         away = (points - camera.center).norm(dim=-1)
-        inside &= (away > camera.near) & (away < camera.far)
+        inside = where_seen(camera, points)[2] & (away > camera.near) & (away < camera.far)
         return bool(inside.any() or meets(camera, scene.box, nine_pixels(camera)).any())
 
     frames = scene.train if frames is None else frames

@@ -16,7 +16,7 @@ from forewarp.data.images import CACHE, by, read_gray16, read_image
 from forewarp.scene.camera import Camera, Lens
 from forewarp.scene.frame import spread
 
-SUFFIXES, KINDS = (".npy", ".png"), ("metric", "relative", "inverse")
+SUFFIXES = (".npy", ".png")
 MILLIMETRES = 1e-3
 LEVELS = 2  # of ARKit's confidence: 0 low, 1 medium, 2 high
 _LOOKED_AT = 4  # files that tell the unit
@@ -62,7 +62,7 @@ class SensedDepth:
         if trust.shape != depth.shape:
             expected = f"{by(depth.shape[::-1])} confidences as {self.path.name}"
             raise mismatch(self.confidence, expected, by(trust.shape[::-1]))
-        size, camera = (self.camera.height, self.camera.width), self.camera
+        camera, size = self.camera, (self.camera.height, self.camera.width)
         if abs(depth.shape[0] * size[1] - depth.shape[1] * size[0]) > max(*depth.shape, *size):
             expected = f"depths of the proportions of its image, {by(size[::-1])} pixels"
             raise mismatch(self.path, expected, by(depth.shape[::-1]))
@@ -70,8 +70,7 @@ class SensedDepth:
             depth = self._fitted(depth)
         planes = torch.from_numpy(np.stack([depth * self.scale, trust * (depth > 0)]).astype(np.float32))
         planes = torch.nn.functional.interpolate(planes[None], size, mode="nearest-exact")[0]
-        inner = camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy, camera.skew
-        planes[0] /= _cosines(*inner, camera.lens)
+        planes[0] /= _cosines(*camera.inner)
         return planes
 
     def _fitted(self, values: np.ndarray) -> np.ndarray:
@@ -130,8 +129,7 @@ def depths_beside(folder: Path, names: Sequence[str]) -> dict[str, Path]:
     """
     if not folder.is_dir():
         raise mismatch("data.depth", "a folder of depths", folder, "set data.depth=null to do without")
-    found = {name: _beside(folder, name) for name in names}
-    found = {name: path for name, path in found.items() if path is not None}
+    found = {name: path for name in names if (path := _beside(folder, name)) is not None}
     if not found:
         expected = f"depths named as images, {Path(names[0]).name}.npy or .png"
         raise mismatch(folder, expected, "none of them", "set data.depth=null to do without")
@@ -157,9 +155,8 @@ def depths_named(paths: Mapping[str, Path]) -> tuple[dict[str, Path], list[str]]
     if len(there) == len(paths):
         return there, []
     absent = next(path for name, path in paths.items() if name not in there)
-    return there, [
-        f"{absent}: {len(paths) - len(there)} of {len(paths)} depths are not there: images go without"
-    ]
+    count = f"{len(paths) - len(there)} of {len(paths)}"
+    return there, [f"{absent}: {count} depths are not there: images go without"]
 
 
 def confidence_of(depth: Path, folder: Path) -> Path | None:
@@ -218,13 +215,12 @@ def _read_confidence(path: Path) -> np.ndarray:
 
 
 @lru_cache(maxsize=8)
-def _cosines(width: int, height: int, *inner: float | Lens | None) -> Tensor:
-    """Return the depth along the optical axis (H, W) of what is at distance 1; once for all images of a
-    camera, as undoing a lens takes long.
+def _cosines(*inner: float | Lens | None) -> Tensor:
+    """Return the depth along the optical axis (H, W) of what is at distance 1, of a camera's ``inner``; once
+    for all images of a camera, as undoing a lens takes long.
     """
-    fx, fy, cx, cy, skew, lens = inner
-    camera = Camera(width, height, fx, fy, cx, cy, torch.eye(4, dtype=torch.float64), 0.0, 1.0, skew, lens)
-    return camera.rays(dtype=torch.float64).directions[:, 2].reshape(height, width).float()
+    camera = Camera.at_origin(*inner)
+    return camera.rays(dtype=torch.float64).directions[:, 2].reshape(camera.height, camera.width).float()
 
 
 def unit_of(paths: Sequence[Path], near: float, far: float) -> tuple[float, list[str]]:
@@ -245,9 +241,7 @@ def unit_of(paths: Sequence[Path], near: float, far: float) -> tuple[float, list
     median = float(np.median(there))
     for unit in (1.0, MILLIMETRES):
         if near / _BEYOND <= unit * median <= _BEYOND * far:
-            line = (
-                f"{paths[0].parent}: depths are taken for thousandths of the cameras' unit, as near and far"
-            )
-            return unit, [] if unit == 1 else [f"{line} say"]
+            line = "depths are taken for thousandths of the cameras' unit, as near and far say"
+            return unit, [] if unit == 1 else [f"{paths[0].parent}: {line}"]
     expected = f"depths between near and far, {near:.4g} and {far:.4g} in the cameras' unit, or thousandths"
     raise mismatch(paths[0].parent, expected, f"{median:.4g} in the median", "write them in that unit")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from functools import reduce
 from itertools import combinations
 
 import torch
@@ -20,9 +21,7 @@ _CONVERT = "convert poses of Unity (left-handed) or PyTorch3D (docs/own-data.md)
 _MEET, _MISS = 0.15, 0.5  # miss of the axes in shares of the distance: they meet in a point, they do not
 
 
-def check_directions(
-    poses: Sequence[torch.Tensor], where: str, *, inverse: bool, advice: str | None = None
-) -> None:
+def check_directions(poses: Sequence[torch.Tensor], where: str, *, inverse: bool, advice: str = "") -> None:
     """Refuse poses that make sense only if they were written in another way than assumed.
 
     Args:
@@ -37,19 +36,18 @@ def check_directions(
     """
     if len(poses) < _LEAST_CAMERAS:
         return
-    miss, ahead, _ = _meeting(torch.stack(list(poses)))
+    poses = torch.stack([*poses])
+    miss, ahead, _ = _meeting(poses)
     expected = "cameras that look at what they surround (OpenGL's axes: x right, y up, looking along -z)"
-    missed, before, _ = _meeting(x_ahead(torch.stack(list(poses))))
+    missed, before, _ = _meeting(x_ahead(poses))
     if (miss >= _MEET or ahead == 0) and missed < min(_MET, miss / 2) and before == 1:
         got = "cameras that look at one point only if x is ahead, as of ROS and Isaac"
         advice = advice or "convert them (docs/own-data.md), or set data.axes=opengl if they are right"
         raise mismatch(where, expected, got, advice)
     if miss < _MEET and ahead == 0:
-        outwards = "data.axes=opengl if they do look outwards"
-        if _rise(opposite(torch.stack(list(poses)))) > _RISE:
-            mended = f"set data.axes=opencv, or {outwards}"
-        else:  # of a mirrored world, too, axes meet; then cameras seem to be below what they look at
-            mended = f"{_CONVERT}; else set data.axes=opencv, or {outwards}"
+        mended = "set data.axes=opencv, or data.axes=opengl if they do look outwards"
+        if _rise(opposite(poses)) <= _RISE:  # as of a mirrored world, in which axes meet, too
+            mended = f"{_CONVERT}; else {mended}"
         raise mismatch(where, expected, "cameras that all look away from one point", advice or mended)
     if miss < _MEET and ahead < _ALL:
         expected, got = "cameras that look at one thing", f"{1 - ahead:.0%} of them that look away from it"
@@ -90,15 +88,13 @@ def other_readings(poses: Sequence[torch.Tensor], changes: Mapping[str, _Change]
     """
     if len(poses) < _LEAST_CAMERAS:
         return []
-    poses, ways = torch.stack(list(poses)), []
+    poses, ways = torch.stack([*poses]), []
     miss, ahead, _ = _meeting(poses)
     if (miss < _MEET and ahead > 0) or _MEET <= miss < _MISS:
         return []
     for count in range(1, len(changes) + 1):
         for names in combinations(changes, count):
-            changed = poses
-            for name in names:
-                changed = changes[name](changed)
+            changed = reduce(lambda poses, name: changes[name](poses), names, poses)
             miss, ahead, _ = _meeting(changed)
             ways += [" and ".join(names)] if miss < _MEET and ahead == 1 else []
         if ways:
@@ -145,7 +141,7 @@ def common_point(poses: Sequence[torch.Tensor]) -> torch.Tensor | None:
     """
     if len(poses) < _LEAST_CAMERAS:
         return None
-    miss, ahead, point = _meeting(torch.stack(list(poses)))
+    miss, ahead, point = _meeting(torch.stack([*poses]))
     return point if miss < _MEET and ahead >= _ALL else None
 
 

@@ -18,57 +18,17 @@ import os
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import islice
 from pathlib import Path
-from reprlib import repr as short
 
 import numpy as np
 from torch import Tensor
 
 from forewarp.data.arrays import StoredDepth, read_truth, write_array, write_truth
-from forewarp.data.cameras import (
-    MOST_UNITS,
-    SPLITS,
-    Normalisation,
-    box_of,
-    frustum_box,
-    opengl_rows,
-    space_of,
-)
+from forewarp.data.cameras import SPLITS, Normalisation, box_of, frustum_box, length_of, opengl_rows, space_of
 from forewarp.data.directions import check_directions, common_point
-from forewarp.data.files import (
-    frames_of,
-    mismatch,
-    nearly,
-    number,
-    read_json,
-    remove,
-    scene_folder,
-    whole,
-)
-from forewarp.data.images import (
-    StoredImage,
-    alpha_of,
-    by,
-    check_pixels,
-    inspect_image,
-    turned_by_exif,
-    write_image,
-)
-from forewarp.data.transforms import (
-    camera_of,
-    check_axes,
-    check_times,
-    hold_out_every,
-    left_aside,
-    pose_in,
-    time_in,
-    times_of,
-    unread_times,
-    with_images,
-    with_intrinsics,
-    with_suffix,
-)
+from forewarp.data.files import mismatch, nearly, number, one_of, read_json, remove, scene_folder, whole
+from forewarp.data.images import StoredImage, alpha_of, by, check_pixels, inspect_image, write_image
+from forewarp.data.transforms import ListedImage, check_times, hold_out_every, image_of, read_frames, times_of
 from forewarp.files import write_json
 from forewarp.scene.box import Box
 from forewarp.scene.camera import Camera
@@ -99,17 +59,18 @@ class Shot:
 
 
 @dataclass(frozen=True)
-class _Record:
-    """A checked entry of a transforms file: ``camera`` at the size of the image, its near and far 0."""
+class _Record(ListedImage):
+    """A checked frame: the ``mask`` that cuts it out, and the file of its ``depth`` with the world units of a
+    step, where it says so.
+    """
 
-    time: float | None
-    camera: Camera
-    image: Path
-    has_alpha: bool
     mask: Path | None
-    depth: tuple[Path, float | None] | None  # file and world units a step, where it says so
+    depth: tuple[Path, float | None] | None
     ability: str
-    by_angle: bool  # the field of view is told by ``camera_angle_x`` alone
+
+    @property
+    def has_alpha(self) -> bool:
+        return self.header.has_alpha or self.mask is not None
 
 
 def read_scene(
@@ -147,13 +108,9 @@ def read_scene(
     Raises:
         SceneError: for every file or value that is missing or wrong, with file and key.
     """
-    near = None if near is None else number(near, "data.near", 0, MOST_UNITS)
-    far = None if far is None else number(far, "data.far", 0, MOST_UNITS)
-    check_axes(axes, inverse)
-    if angle not in ("width", "longer"):
-        raise mismatch("data.angle", "width or longer", repr(angle))
-    if half_resolution not in (True, False, "auto"):
-        raise mismatch("data.half_resolution", "true, false or auto", repr(half_resolution))
+    near, far = length_of(near, "data.near"), length_of(far, "data.far")
+    one_of(angle, "data.angle", "width", "longer")
+    one_of(half_resolution, "data.half_resolution", True, False, "auto")
     folder = scene_folder(root, scene, "dnerf")
     every = whole(test_every, "data.test_every", 2)
     records, assumed = _read_records(folder, axes, inverse, angle == "longer", every)
@@ -163,7 +120,7 @@ def read_scene(
     if halve and (size[0] % 2 or size[1] % 2):
         raise mismatch(folder, "even sides to halve", by(size), "set data.half_resolution=false")
     width, height = (n // 2 if halve else n for n in size)
-    cut_out = [record.image for record in records["train"] if record.has_alpha and record.mask is None]
+    cut_out = [record.path for record in records["train"] if record.has_alpha and record.mask is None]
     premultiplied, told = alpha_of(alpha, cut_out, folder)
     assumed += told
 
@@ -174,27 +131,16 @@ def read_scene(
     def frame(record: _Record) -> Frame:
         camera = space.camera(record.camera)
         camera = camera.resized(width, height) if halve else camera
-        name = record.image.relative_to(folder).with_suffix("").as_posix()
+        load = StoredImage(record.path, size, 1 + halve, record.mask, premultiplied=premultiplied)
         depth = StoredDepth(record.depth[0], size, halve, record.depth[1]) if record.depth else None
-        return Frame(
-            name,
-            record.time,
-            camera,
-            StoredImage(record.image, size, halve, record.mask, premultiplied=premultiplied),
-            depth,
-            record.ability,
-        )
+        return Frame(_name(folder, record), record.time, camera, load, depth, record.ability)
 
     train, val, test = (tuple(map(frame, records[split])) for split in SPLITS)
     canonical = min(f.time for f in train)
-    protocol = {
-        "dataset": "dnerf",
-        "resolution": [width, height],
-        "half_resolution": halve,
-        "test_frames": len(test),
-    }
+    protocol = {"dataset": "dnerf", "resolution": [width, height], "half_resolution": halve}
+    protocol["test_frames"] = len(test)
     if space.scale != 1 or any(space.center):
-        protocol["normalisation"] = {"center": list(space.center), "scale": space.scale}
+        protocol["normalisation"] = space.told
     if assumed:
         protocol["assumed"] = assumed
     truth = read_truth(folder / "trajectories.npz", canonical)
@@ -236,11 +182,11 @@ def _common(records: Sequence[_Record]) -> tuple[tuple[int, int], bool]:
     for record in records:
         size, expected = ((r.camera.width, r.camera.height) for r in (record, first))
         if size != expected:
-            raise mismatch(record.image, f"{by(expected)} pixels as the first", by(size))
+            raise mismatch(record.path, f"{by(expected)} pixels as the first", by(size))
     bare = [record for record in records if not record.has_alpha]
     if 0 < len(bare) < len(records):
-        got = f"{len(bare)} of {len(records)} without, as {bare[0].image}"
-        raise mismatch(first.image.parent, "an alpha channel in all images or in none", got)
+        got = f"{len(bare)} of {len(records)} without, as {bare[0].path}"
+        raise mismatch(first.path.parent, "an alpha channel in all images or in none", got)
     return (first.camera.width, first.camera.height), not bare
 
 
@@ -251,18 +197,18 @@ def _read_records(
     records, assumed = {}, []
     for split in SPLITS:
         files = _files(folder, split)
-        found = [_read_file(path, ability, axes, inverse, longer) for path, ability in files.items()]
-        records[split] = [record for part, _ in found for record in part]
-        assumed += [line for _, lines in found for line in lines]
+        options = {"axes": axes, "inverse": inverse, "longer": longer}
+        parts = [_read_file(path, ability, **options) for path, ability in files.items()]
+        records[split] = [record for part, _ in parts for record in part]
+        assumed += [line for _, lines in parts for line in lines]
     everything = [record for split in SPLITS for record in records[split]]
-    names = [record.image.relative_to(folder).with_suffix("").as_posix() for record in everything]
-    given = [record.time for record in everything]
-    times, told = times_of(names, given, str(folder))
+    names = [_name(folder, record) for record in everything]
+    times, told = times_of(names, [record.time for record in everything], str(folder))
     assumed += [told] if told else []
-    pairs = iter(zip(names, given))
-    check_times({split: dict(islice(pairs, len(records[split]))) for split in SPLITS}, str(folder))
-    timed = iter(replace(record, time=time) for record, time in zip(everything, times))
-    records = {split: [next(timed) for _ in records[split]] for split in SPLITS}
+    given = {split: {_name(folder, record): record.time for record in records[split]} for split in SPLITS}
+    check_times(given, str(folder))
+    each = iter(times)
+    records = {split: [replace(record, time=next(each)) for record in records[split]] for split in SPLITS}
     if not records["test"]:
         ordered = sorted(records["train"], key=lambda record: record.time)
         records["train"], records["test"] = hold_out_every(ordered, test_every)
@@ -270,25 +216,25 @@ def _read_records(
         assumed.append(f"{line} ({len(records['test'])}; data.test_every)")
         if not records["test"]:
             raise mismatch(folder, "images to test on, or at least 3 to train on", f"{len(ordered)} in all")
-    trained = {record.image for record in records["train"]}
+    trained = {record.path for record in records["train"]}
     agree = [s for s in SPLITS if common_point([r.camera.camera_to_world for r in records[s]]) is not None]
     for split in SPLITS:
-        images = Counter(record.image for record in records[split]).most_common(1)
-        if images and images[0][1] > 1:
-            raise mismatch(
-                f"{folder}: {split}", "each image once", f"{images[0][0].name} twice", "remove one"
-            )
+        for path, count in Counter(record.path for record in records[split]).most_common(1):
+            if count > 1:
+                raise mismatch(f"{folder}: {split}", "each image once", f"{path.name} twice", "remove one")
         poses = [record.camera.camera_to_world for record in records[split]]
-        advice, other = None, next((s for s in agree if s != split), None)
+        advice, other = "", next((s for s in agree if s != split), None)
         if other or split != "train":
             wanted = f"as in transforms_{other}.json" if other else "all in OpenGL's axes (docs/own-data.md)"
             advice = f"write them {wanted}, or set data.axes=opengl if they are right"
         if axes is None:
             check_directions(poses, f"{folder}: {split} images", inverse=inverse, advice=advice)
-        if split != "train" and (both := sum(record.image in trained for record in records[split])):
+        if split != "train" and (both := sum(record.path in trained for record in records[split])):
             assumed.append(f"{folder}: {both} {split} images are trained on, too; their scores say little")
-    portrait = [r for r in everything if r.by_angle and r.camera.height > r.camera.width]
-    if portrait and not longer:
+    upright = [record.entry for record in everything if record.camera.height > record.camera.width]
+    keys = ("camera_angle_x", "fl_x", "fl_y")
+    by_angle = any([entry.get(key) is None for key in keys] == [False, True, True] for entry in upright)
+    if by_angle and not longer:
         line = f"{folder}: camera_angle_x taken as the angle of the width of these upright images"
         assumed.append(f"{line}; if it is that of the height, as of Blender's, set data.angle=longer")
     return records, assumed
@@ -309,43 +255,38 @@ def _files(folder: Path, split: str) -> dict[Path, str]:
     return files or parts
 
 
-def _read_file(
-    path: Path, ability: str, axes: str | None, inverse: bool, longer: bool
-) -> tuple[list[_Record], list[str]]:
-    """Read a transforms file; without its images where it is of a test split that was never rendered."""
-    content, records, turned = read_json(path), [], []
-    entries = frames_of(path, content, content | {"ability": ability})
-    entries, unread = with_intrinsics(entries, str(path))
-    images = [with_suffix(entry.path("file_path")) for entry in entries]
-    if ability != "all" or path.stem == "transforms_train" or any(os.path.isfile(i) for i in images):
-        there, assumed = with_images(list(zip(entries, images)), images, str(path))
-    else:
-        there, assumed = [], [f"{path}: none of its {len(images)} images is there: left out"]
+def _name(folder: Path, record: _Record) -> str:
+    return record.path.relative_to(folder).with_suffix("").as_posix()
+
+
+def _read_file(path: Path, ability: str, **options) -> tuple[list[_Record], list[str]]:
+    """Read a transforms file; without its images where it is of a test split that was never rendered.
+
+    Args:
+        path: of the file.
+        ability: of its frames that name none.
+        options: axes, inverse and longer, as of ``read_frames``.
+    """
+    content, records = read_json(path), []
+    optional = ability == "all" and path.stem != "transforms_train"
+    images, assumed = read_frames(path, content, **options, optional=optional)
     if ours := [key for key in ("near", "far", "aabb") if content.get(key) is not None]:
         keys = "data.near, data.far and data.box"
         assumed.append(f"{path}: {', '.join(ours)} left aside, as this layout has none; set {keys}")
-    for entry, image in there:
-        depth, ability = None, entry.get("ability")
+    for image in images:
+        entry, depth, mask = image.entry, None, None
         if "depth_file_path" in entry.own:
             file, scale = entry.path("depth_file_path"), entry.get("depth_scale")
             if not os.path.isfile(file):
                 raise mismatch(entry.where("depth_file_path"), "an existing file", file, nearly(file))
             depth = file, None if scale is None else entry.number("depth_scale", 1e-12, 1e6)
-        if ability not in (*ABILITIES, "all"):
-            raise mismatch(entry.where("ability"), f"one of {', '.join(ABILITIES)}", short(ability))
-        header, mask = inspect_image(image), None
-        turned += [image] if header.is_turned else []
+        own = entry.own.get("ability", ability)
+        one_of(own, entry.where("ability"), *ABILITIES, "all")
         if "mask_path" in entry.own:
-            mask = with_suffix(entry.path("mask_path"))
-            inspect_image(mask, header.size, f" as {image.name}")
-        has_alpha = header.has_alpha or mask is not None
-        pose = pose_in(entry, axes, inverse)
-        camera = camera_of(entry, header.size, 1, image, pose=pose, longer=longer)
-        by_angle = entry.get("camera_angle_x") is not None
-        by_angle &= entry.get("fl_x") is None and entry.get("fl_y") is None
-        records.append(_Record(time_in(entry), camera, image, has_alpha, mask, depth, ability, by_angle))
-    assumed += unread + turned_by_exif(turned, path) + unread_times(entries, str(path))
-    return records, assumed + left_aside(zip((entry for entry, _ in there), (r.camera for r in records)))
+            mask = image_of(entry, "mask_path")
+            inspect_image(mask, image.header.size, f" as {image.path.name}")
+        records.append(_Record(**vars(image), mask=mask, depth=depth, ability=own))
+    return records, assumed
 
 
 def write_scene(

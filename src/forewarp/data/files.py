@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import glob
 import hashlib
+import json
 import operator
 import os
 import re
@@ -35,19 +36,8 @@ LAYOUTS = {  # what people call a layout: a file or folder that tells it, and wh
     "COLMAP": ("sparse", "forewarp-capture images=<its images> colmap=<its sparse/0>"),
     "DyNeRF": ("poses_bounds.npy", "experiment=multicam"),
 }
-UNREAD = {
-    ".webp",
-    ".tif",
-    ".tiff",
-    ".heic",
-    ".heif",
-    ".avif",
-    ".bmp",
-    ".gif",
-    ".jxl",
-    ".jp2",
-    ".exr",
-}  # of images
+# Suffixes of images that are not read.
+UNREAD = {".webp", ".tif", ".tiff", ".heic", ".heif", ".avif", ".bmp", ".gif", ".jxl", ".jp2", ".exr"}
 RECORD = "synthesis.json"  # of every synthesised scene, or folder of them
 LOCK = ".lock"  # of every folder of a run
 _UNPRINTABLE = {"Cc", "Cs", "Zl", "Zp"}  # control characters, surrogates, line and paragraph separators
@@ -98,18 +88,16 @@ def nearly(path: Path) -> str:
         stem = re.sub(r"(\.[a-z]\w{2,4})+$", "", name.casefold())
         return re.sub(r"\d+", lambda digits: digits[0].lstrip("0"), stem)
 
-    there = []
     with suppress(OSError):  # a folder that may not be listed
-        there = sorted(name for name in os.listdir(path.parent) if core(name) == core(path.name))
-    if not there:
-        return ""
-    advice = ": convert it to PNG or JPEG" if Path(there[0]).suffix.lower() in UNREAD else ""
-    return f"{path.parent.name}/{there[0]} is there{advice}"
+        for name in sorted(name for name in os.listdir(path.parent) if core(name) == core(path.name)):
+            advice = ": convert it to PNG or JPEG" if Path(name).suffix.lower() in UNREAD else ""
+            return f"{path.parent.name}/{name} is there{advice}"
+    return ""
 
 
-def read_bytes(path: Path, most: int = MOST_BYTES) -> bytes:
+def read_bytes(path: Path, most: int = MOST_BYTES, what: str = "a readable file") -> bytes:
     """Read a file; SceneError as ``opened``."""
-    with opened(path, most) as stream:
+    with opened(path, most, what) as stream:
         return stream.read()
 
 
@@ -137,6 +125,18 @@ def number(value: object, where: str, low: float = -inf, high: float = inf) -> f
         within = "" if (low, high) == (-inf, inf) else f" in [{low:g}, {high:g}]"
         raise mismatch(where, f"a number{within}", short(value))
     return float(value)
+
+
+def one_of(value: object, where: str, *allowed: object, advice: str = "") -> None:
+    """Refuse a value that is none of those ``allowed``; ``where`` names the key.
+
+    >>> one_of("yes", "data.half", True, False, "auto")
+    Traceback (most recent call last):
+    forewarp.data.files.SceneError: data.half: expected true, false or auto, but got 'yes'
+    """
+    if value not in allowed:
+        *texts, last = (json.dumps(each).strip('"') for each in allowed)  # as YAML writes them
+        raise mismatch(where, f"{', '.join(texts)} or {last}", short(value), advice)
 
 
 def whole(value: object, where: str, least: int, multiple: int = 1) -> int:
@@ -179,9 +179,8 @@ def inside(folder: Path, name: object, where: str) -> Path:
     """
     is_text = isinstance(name, str) and not any(category(c) in _UNPRINTABLE for c in name)
     normal = os.path.normpath(name.replace("\\", "/")) if is_text and name else ".."
-    if re.match("[A-Za-z]:", normal):  # a drive of Windows
-        normal = ".."
-    if os.path.isabs(normal) or normal.split(os.sep)[0] in ("..", "."):
+    is_drive = re.match("[A-Za-z]:", normal)  # of Windows
+    if is_drive or os.path.isabs(normal) or normal.split(os.sep)[0] in ("..", "."):
         raise mismatch(where, "a path inside the scene folder", short(name))
     return folder / normal
 
@@ -211,9 +210,7 @@ class Entry:
         """Check a number as ``number`` does."""
         return number(self.get(key, default), self.where(key), low, high)
 
-    def numbers(
-        self, key: str, count: int, low: float = -inf, high: float = inf, default=None
-    ) -> list[float]:
+    def numbers(self, key: str, count: int, low=-inf, high=inf, default=None) -> list[float]:
         """Check a list of ``count`` numbers."""
         values, where = self.get(key, default), self.where(key)
         if not isinstance(values, list) or len(values) != count:
@@ -259,26 +256,24 @@ def scene_folder(root: str | Path, scene: str, reader: str) -> Path:
     root, marker = Path(root), MARKERS[reader]
     if not root.is_dir():
         raise mismatch("data.root", "an existing folder", root, "set data.root")
-    if not scene or not (root / scene / marker).is_file():
-        file = root / scene / marker
-        there = ", ".join(sorted(p.name for p in root.iterdir() if (p / marker).is_file())) or "none"
-        advice = f"scenes in {root}: {there}"
-        if scene and (other := layout_of(root / scene)):
-            advice = f"this is a scene in the layout of {other}: use {LAYOUTS[other][1]}"
-        if deeper := sorted(root.glob(f"*/{glob.escape(scene)}/{marker}")) if scene else []:
-            advice = f"did you mean data.root={deeper[0].parents[len(Path(scene).parts)]}?"
-        if (root / marker).is_file():
-            folder = root.resolve()
-            advice = f"did you mean data.root={folder.parent} data.scene={folder.name}?"
-        advice = (scene and file.parent.is_dir() and nearly(file)) or advice
-        raise mismatch(root / scene, f"a scene with {marker}", "none", advice)
-    return root / scene
+    folder = root / scene
+    if scene and (folder / marker).is_file():
+        return folder
+    there = ", ".join(sorted(p.name for p in root.iterdir() if (p / marker).is_file())) or "none"
+    advice = f"scenes in {root}: {there}"
+    if scene and (other := layout_of(folder)):
+        advice = f"this is a scene in the layout of {other}: use {LAYOUTS[other][1]}"
+    if deeper := sorted(root.glob(f"*/{glob.escape(scene)}/{marker}")) if scene else []:
+        advice = f"did you mean data.root={deeper[0].parents[len(Path(scene).parts)]}?"
+    if (root / marker).is_file():
+        advice = f"did you mean data.root={root.resolve().parent} data.scene={root.resolve().name}?"
+    advice = (scene and folder.is_dir() and nearly(folder / marker)) or advice
+    raise mismatch(folder, f"a scene with {marker}", "none", advice)
 
 
 def layout_of(folder: Path) -> str | None:
     """Name the layout of a scene's folder by the file that every scene of it has; None: of none known."""
-    there = [name for name, (marker, _) in LAYOUTS.items() if (folder / marker).exists()]
-    return there[0] if there else None
+    return next((name for name, (marker, _) in LAYOUTS.items() if (folder / marker).exists()), None)
 
 
 def remove(folder: Path, *patterns: str) -> None:
@@ -329,5 +324,5 @@ def _files(folder: Path) -> list[Path]:
         visited.add(real)
         folders[:] = sorted(name for name in folders if not name.startswith("."))
         paths = (Path(place) / name for name in sorted(names) if not name.startswith("."))
-        files += [path for path in paths if path.is_file()]
+        files += filter(Path.is_file, paths)
     return files

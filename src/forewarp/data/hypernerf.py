@@ -37,6 +37,7 @@ from forewarp.data.cameras import (
     check_middle,
     frustum_box,
     pose_of,
+    smaller,
 )
 from forewarp.data.depth import SensedDepth, depths_beside, unit_of
 from forewarp.data.directions import by_translation, opposite, other_readings, transposed
@@ -46,8 +47,9 @@ from forewarp.data.images import (
     StoredImage,
     StoredMask,
     check_pixels,
+    exif_turned,
+    in_order,
     inspect_image,
-    turned_by_exif,
     write_image,
 )
 from forewarp.data.transforms import check_pinhole, check_times, numbers_in, with_images, with_suffix
@@ -117,8 +119,8 @@ def read_scene(
     folder = scene_folder(root, scene, "hypernerf")
     images = folder / "rgb" / f"{whole(scale, 'data.scale', 1)}x"
     if not images.is_dir():
-        there = sorted((p.name for p in folder.glob("rgb/*x") if p.is_dir()), key=lambda n: (len(n), n))
-        advice = f"set data.scale to one of those there: {', '.join(there) or 'none'}"
+        there = ", ".join(in_order(p.name for p in folder.glob("rgb/*x") if p.is_dir())) or "none"
+        advice = f"set data.scale to one of those there: {there}"
         raise mismatch(images, "a folder of images", "none", advice)
     world = Entry(folder / "scene.json", read_json(folder / "scene.json"))
     center, size = world.numbers("center", 3, -MOST_UNITS, MOST_UNITS), world.number("scale", *_SCALES)
@@ -129,14 +131,12 @@ def read_scene(
     how, ids, train_ids, test_ids = _read_split(folder / "dataset.json")
     of_train, of_test = (part if split is None else f"{part}_{split}" for part in ("train", "val"))
     if split is not None or (folder / "splits" / "train.json").is_file():
-        train_ids, test_ids = (
-            _listed(folder / "splits" / f"{part}.json", ids) for part in (of_train, of_test)
-        )
-        if both := {*train_ids} & {*test_ids}:
-            where = folder / "splits" / f"{of_test}.json"
-            raise mismatch(f"{where}: frame_names", f"none of {of_train}.json", short(min(both)))
+        wheres = [folder / "splits" / f"{part}.json" for part in (of_train, of_test)]
+        train_ids, test_ids = (_names(where, "frame_names", read_json(where), ids) for where in wheres)
+        _check_apart(train_ids, test_ids, f"{wheres[1]}: frame_names", f"{of_train}.json")
         how = f"splits/{of_train}.json and {of_test}.json"
-    times, camera_ids, numbers, assumed = _read_items(folder / "metadata.json", ids)
+    numbers, camera_ids, assumed = _read_items(folder / "metadata.json", ids)
+    first, last = min(numbers.values()), max(numbers.values())
     where = f"{folder / 'dataset.json'}: ids"
     paths = {item: with_suffix(inside(images, item, where)) for item in ids}
     there, told = with_images(ids, list(paths.values()), where)
@@ -146,9 +146,7 @@ def read_scene(
         if not names:
             raise mismatch(folder / "dataset.json", f"an image of {part} that is there", "none")
 
-    stored: dict[str, Tensor] = {}  # poses in the unscaled world
-    turned: list[Path] = []
-    depths, unit = {}, size
+    poses, turned, depths, unit = [], [], {}, size  # poses of the unscaled world, images that EXIF turns
     if depth is not None:
         place = inside(folder, depth, "data.depth") / f"{scale}x"
         depths = depths_beside(place, train_ids)
@@ -158,8 +156,8 @@ def read_scene(
     def frame(item: str) -> Frame:
         path = paths[item]
         camera = read_camera(inside(folder / "camera", f"{item}.json", where), near, far)
-        stored[item] = camera.camera_to_world
-        camera = reduced(normalised.camera(camera), scale)
+        poses.append(camera.camera_to_world)
+        camera = smaller(normalised.camera(camera), scale)
         size = camera.width, camera.height
         header, options = inspect_image(path, size, f", the camera's image_size / {scale}"), {}
         if header.is_turned:
@@ -178,14 +176,15 @@ def read_scene(
         if points.is_file():
             options["keypoints"] = _read_keypoints(points)
         load = StoredImage(path, size, opaque=True)
-        return Frame(item, times[item], camera, load, camera_id=camera_ids[item], **options)
+        time = (numbers[item] - first) / ((last - first) or 1)
+        return Frame(item, time, camera, load, camera_id=camera_ids[item], **options)
 
     train, test = (tuple(map(frame, items)) for items in (train_ids, test_ids))
     splits = {"train": train_ids, "val": test_ids}
     numbered = {split: {item: numbers[item] for item in items} for split, items in splits.items()}
     check_times(numbered, str(folder / "metadata.json"))
-    if len({*numbers.values()}) == 1:
-        assumed.append(f"{folder / 'metadata.json'}: all items are of time {numbers[ids[0]]}: one moment")
+    if first == last:
+        assumed.append(f"{folder / 'metadata.json'}: all items are of time {first}: one moment")
     canonical, points = middle_of(f.time for f in train), folder / "points.npy"
     counts = {len(f.keypoints) for f in train if f.keypoints is not None}
     if len(counts) > 1:
@@ -201,13 +200,13 @@ def read_scene(
     }
     if (folder / "extra.json").is_file():
         extra = Entry(folder / "extra.json", read_json(folder / "extra.json"))
-        protocol["seconds"] = (max(numbers.values()) - min(numbers.values())) / extra.number("fps", *_RATES)
+        protocol["seconds"] = (last - first) / extra.number("fps", *_RATES)
     if depth is not None:
         protocol["depth"] = f"{depth}, of {len(depths)} of {len(train)} training frames"
     if any(f.load_valid for f in train):
         protocol["masks"] = "ignore: pixels of alpha 0 are not trained or measured on"
-    assumed += turned_by_exif(turned, images)
-    if ways := other_readings(list(stored.values()), _READINGS):
+    assumed += exif_turned(turned, images)
+    if ways := other_readings(poses, _READINGS):
         line = "cameras do not look at one thing, as all of them do if"
         assumed.append(f"{folder / 'camera'}: {line} {', or if '.join(ways)}; if so, write them anew")
     if assumed:
@@ -320,35 +319,18 @@ def write_camera(path: Path, camera: Camera) -> None:
     write_json(path, content)
 
 
-def reduced(camera: Camera, scale: int) -> Camera:
-    """Scale a camera to an image whose sides are ``scale`` times smaller; sizes are rounded, all else exact.
-
-    The skew shrinks too. Public loaders leave it as it is, which slants the image wherever it is not 0.
-    """
-    size = {"width": round(camera.width / scale), "height": round(camera.height / scale)}
-    pixels = {key: getattr(camera, key) / scale for key in ("fx", "fy", "cx", "cy", "skew")}
-    return replace(camera, **size, **pixels)
-
-
 def _read_split(path: Path) -> tuple[str, list[str], list[str], list[str]]:
     """Read how a ``dataset.json`` is split: vrig or interpolation, all items, those to train and to test on.
 
     Raises:
         SceneError: for lists that are none, name an item twice, an unknown one or one in both parts.
     """
-    content = read_json(path)
-    lists = {key: content.get(key, []) for key in ("ids", "train_ids", "val_ids")}
-    for key, ids in lists.items():
-        if not isinstance(ids, list) or not all(isinstance(i, str) for i in ids) or len({*ids}) < len(ids):
-            raise mismatch(f"{path}: {key}", "a list of different names", short(ids))
-    ids, train, val = lists.values()
+    content = {"ids": [], "train_ids": [], "val_ids": []} | read_json(path)
+    ids = _names(path, "ids", content)
     if len(ids) > files.MOST_FRAMES:
         raise mismatch(f"{path}: ids", f"at most {files.MOST_FRAMES} items", len(ids))
-    for key in ("train_ids", "val_ids"):
-        if unknown := [i for i in lists[key] if i not in {*ids}]:
-            raise mismatch(f"{path}: {key}", "items of ids", short(unknown[0]), "list it in ids")
-    if both := {*train} & {*val}:
-        raise mismatch(f"{path}: val_ids", "none of train_ids", short(min(both)))
+    train, val = (_names(path, key, content, ids) for key in ("train_ids", "val_ids"))
+    _check_apart(train, val, f"{path}: val_ids", "train_ids")
     if val and not train:
         raise mismatch(f"{path}: train_ids", "at least one beside val_ids", "none")
     if val:
@@ -360,18 +342,21 @@ def _read_split(path: Path) -> tuple[str, list[str], list[str], list[str]]:
     return "interpolation", ids, [ids[i] for i in chosen], [ids[i + _EVERY // 2] for i in chosen[:-1]]
 
 
-def _listed(path: Path, ids: list[str]) -> list[str]:
-    """Read the ``frame_names`` of a split; SceneError where they are no different items of ``ids``."""
-    names = read_json(path).get("frame_names")
-    if (
-        not isinstance(names, list)
-        or not all(isinstance(n, str) for n in names)
-        or len({*names}) < len(names)
-    ):
-        raise mismatch(f"{path}: frame_names", "a list of different names", short(names))
-    if unknown := [name for name in names if name not in {*ids}]:
-        raise mismatch(f"{path}: frame_names", "items of dataset.json", short(unknown[0]), "list it in ids")
+def _names(path: Path, key: str, content: dict, ids: list[str] | None = None) -> list[str]:
+    """Check the list ``key`` of a file: different names, of ``ids`` if given; else SceneError."""
+    names = content.get(key)
+    are_names = isinstance(names, list) and all(isinstance(name, str) for name in names)
+    if not are_names or len({*names}) < len(names):
+        raise mismatch(f"{path}: {key}", "a list of different names", short(names))
+    known = {*names} if ids is None else {*ids}
+    if unknown := [name for name in names if name not in known]:
+        raise mismatch(f"{path}: {key}", "items of dataset.json's ids", short(unknown[0]), "list it in ids")
     return names
+
+
+def _check_apart(train: list[str], test: list[str], where: str, of_train: str) -> None:
+    if both := {*train} & {*test}:
+        raise mismatch(where, f"none of {of_train}", short(min(both)))
 
 
 def _read_keypoints(path: Path) -> Tensor:
@@ -386,15 +371,12 @@ def _read_keypoints(path: Path) -> Tensor:
     return points
 
 
-def _read_items(
-    path: Path, ids: list[str]
-) -> tuple[dict[str, float], dict[str, int | None], dict[str, int], list[str]]:
-    """Read the time in [0, 1] of each item of a ``metadata.json``, its camera's number, where it has one, and
-    the number of its moment; also say in lines what was assumed.
+def _read_items(path: Path, ids: list[str]) -> tuple[dict[str, int], dict[str, int | None], list[str]]:
+    """Read the number of each item's moment in a ``metadata.json``, and of its camera, where it has one; also
+    say in lines what was assumed.
 
-    The time is ``time_id``, or where none of ``ids`` has one ``warp_id``, between the least and the greatest
-    of them; where that only counts the items, one camera after the other, the number in their names. Entries
-    of other items are not looked at.
+    A moment is ``time_id``, or where none of ``ids`` has one ``warp_id``; where that only counts the items,
+    one camera after the other, the number in their names. Entries of other items are not looked at.
 
     Raises:
         SceneError: for an item that is missing or has no time, and for a number that is not whole.
@@ -405,25 +387,21 @@ def _read_items(
             raise mismatch(f"{path}: {item!r}", "an object for this item", short(content.get(item)))
     entries = {item: Entry(path, content[item], f"{item!r}.") for item in ids}
     key = "time_id" if any("time_id" in entry.own for entry in entries.values()) else "warp_id"
-    numbers: dict[str, dict] = {key: {}, "camera_id": dict.fromkeys(ids)}
-    for item, entry in entries.items():
-        for name in numbers:
-            if name == "camera_id" and entry.get(name) is None:
-                continue
-            number = entry.number(name, 0, _MOST_MOMENTS)
-            if number % 1:
-                raise mismatch(entry.where(name), "a whole number", f"{number:g}")
-            numbers[name][item] = int(number)
-    moments, assumed = numbers[key], []
+
+    def counted(entry: Entry, name: str) -> int:
+        number = entry.number(name, 0, _MOST_MOMENTS)
+        if number % 1:
+            raise mismatch(entry.where(name), "a whole number", f"{number:g}")
+        return int(number)
+
+    moments, cameras = {item: counted(entry, key) for item, entry in entries.items()}, dict.fromkeys(ids)
+    having = {item: entry for item, entry in entries.items() if entry.get("camera_id") is not None}
+    cameras |= {item: counted(entry, "camera_id") for item, entry in having.items()}
     named = dict(zip(ids, numbers_in(ids) or []))
-    if key == "warp_id" and _counts_items(moments, named, numbers["camera_id"]):
-        moments = named
-        said = "counts the items of one camera after the other: times are the numbers in their names"
-        assumed = [f"{path}: warp_id {said}; write time_id if they are wrong"]
-    first, last = min(moments.values()), max(moments.values())
-    span = (last - first) or 1
-    times = {item: (number - first) / span for item, number in moments.items()}
-    return times, numbers["camera_id"], moments, assumed
+    if key == "time_id" or not _counts_items(moments, named, cameras):
+        return moments, cameras, []
+    said = "counts the items of one camera after the other: times are the numbers in their names"
+    return named, cameras, [f"{path}: warp_id {said}; write time_id if they are wrong"]
 
 
 def _counts_items(warps: dict[str, int], named: dict[str, float], cameras: dict[str, int | None]) -> bool:
@@ -431,15 +409,9 @@ def _counts_items(warps: dict[str, int], named: dict[str, float], cameras: dict[
     several cameras one number, and it does not grow with that.
     """
     pairs = {(number, cameras[item]) for item, number in named.items()}
-    if (
-        not named
-        or None in cameras.values()
-        or len(pairs) < len(named)
-        or len({*warps.values()}) < len(warps)
-    ):
-        return False
+    are_distinct = len(pairs) == len(named) and len({*warps.values()}) == len(warps)
     in_turn = [named[item] for item in sorted(named, key=warps.get)]
-    return in_turn != sorted(in_turn)
+    return are_distinct and None not in cameras.values() and in_turn != sorted(in_turn)
 
 
 def _write_shot(folder: Path, shot: RigShot, scales: Sequence[int]) -> None:
@@ -450,10 +422,8 @@ def _write_shot(folder: Path, shot: RigShot, scales: Sequence[int]) -> None:
         write_image(folder / "rgb" / f"{s}x" / f"{shot.name}.png", np.rint(means).astype(np.uint8))
         middles = slice(s // 2, None, s), slice(s // 2, None, s)  # depths of two things have no mean
         for kind, values in (("depth", shot.depth), ("confidence", shot.confidence)):
-            if values is not None:
-                write_array(
-                    folder / kind / f"{s}x" / f"{shot.name}.npy", np.asarray(values)[middles][..., None]
-                )
+            values = None if values is None else np.asarray(values)[middles][..., None]
+            write_array(folder / kind / f"{s}x" / f"{shot.name}.npy", values)
         if shot.covisible is not None:
             mask = np.uint8(255) * np.asarray(shot.covisible, bool)[middles]
             write_image(folder / "covisible" / f"{s}x" / (shot.split or "val") / f"{shot.name}.png", mask)

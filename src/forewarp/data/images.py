@@ -10,6 +10,7 @@ import warnings
 import weakref
 from collections import OrderedDict
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from datetime import datetime, timezone
 from pathlib import Path
@@ -21,7 +22,7 @@ from PIL import Image, ImageOps, UnidentifiedImageError
 from torch import Tensor
 
 from forewarp.clock import left_out
-from forewarp.data.files import mismatch, number, opened
+from forewarp.data.files import mismatch, number, one_of, opened, read_bytes
 from forewarp.files import MOST_IMAGE, written_whole
 from forewarp.ops.grid import block_means, block_sums
 from forewarp.scene.frame import spread
@@ -155,7 +156,7 @@ def inspect_image(path: Path, size: tuple[int, int] | None = None, why: str = ""
     return header
 
 
-def turned_by_exif(paths: Sequence[Path], where: object) -> list[str]:
+def exif_turned(paths: Sequence[Path], where: object) -> list[str]:
     """Say in a line that images were read as stored, although their EXIF orientation turns them.
 
     Args:
@@ -217,13 +218,13 @@ def check_pixels(where: object, pixels: Tensor | np.ndarray, *shapes: tuple[int,
     return pixels
 
 
-def write_image(path: Path, pixels: Tensor | np.ndarray, quality: int = 97) -> None:
+def write_image(path: Path, pixels: Tensor | np.ndarray) -> None:
     """Write uint8 pixels, whole or not at all: (H, W), (H, W, 3) or, as .png, (H, W, 4).
 
-    A JPEG has full colour resolution; ``quality`` is its.
+    A JPEG has full colour resolution and little loss.
     """
     is_png = path.suffix.lower() == ".png"
-    options = {"format": "PNG"} if is_png else {"format": "JPEG", "quality": quality, "subsampling": 0}
+    options = {"format": "PNG"} if is_png else {"format": "JPEG", "quality": 97, "subsampling": 0}
     with written_whole(path) as beside:
         Image.fromarray(np.ascontiguousarray(pixels)).save(beside, **options)
 
@@ -302,8 +303,7 @@ def alpha_of(alpha: str | None, paths: Sequence[Path], where: object) -> tuple[b
     Raises:
         SceneError: for another value.
     """
-    if alpha not in (None, "straight", "premultiplied"):
-        raise mismatch("data.alpha", "straight, premultiplied or null", repr(alpha))
+    one_of(alpha, "data.alpha", "straight", "premultiplied", None)
     if alpha is not None or not paths:
         return alpha == "premultiplied", []
     if not is_premultiplied(read_image(paths[i]) for i in spread(len(paths), _EDGES_OF)):
@@ -328,7 +328,8 @@ class StoredImage:
     Args:
         path: of the image.
         size: (width, height), what the files must hold.
-        halve: average 2 x 2 pixels; of a cut-out an odd last row or column is cut off.
+        factor: average blocks of so many pixels a side; of a cut-out, at most 2, an odd last row or column is
+            cut off.
         mask: of the same size; what is foreground see ``bright``.
         opaque: leave the image's own alpha aside.
         premultiplied: colours on disk are multiplied by alpha.
@@ -338,12 +339,12 @@ class StoredImage:
         self,
         path: Path,
         size: tuple[int, int],
-        halve: bool = False,
+        factor: int = 1,
         mask: Path | None = None,
         opaque: bool = False,
         premultiplied: bool = False,
     ) -> None:
-        self.path, self.size, self.halve, self.mask = path, size, halve, mask
+        self.path, self.size, self.factor, self.mask = path, size, factor, mask
         self.opaque, self.premultiplied = opaque, premultiplied
         self._corner = (0, 0)
 
@@ -353,7 +354,7 @@ class StoredImage:
         if self.mask is None:
             return part
         (row, column), (rows, columns) = self._corner, part.shape[:2]
-        width, height = (n // 2 if self.halve else n for n in self.size)
+        width, height = (n // self.factor for n in self.size)
         whole = torch.zeros(height, width, 4, dtype=torch.uint8)
         whole[row : row + rows, column : column + columns] = part
         return whole
@@ -366,9 +367,9 @@ class StoredImage:
         if self.opaque:
             rgba[..., 3] = 255
         if self.mask is None:
-            return reduced(rgba) if self.halve else rgba
+            return rgba if self.factor == 1 else reduced(rgba, self.factor)
         rgba *= (bright(self.mask, self.size) & (rgba[..., 3] > 0))[..., None]
-        rgba = halved_cutout(rgba) if self.halve else rgba
+        rgba = rgba if self.factor == 1 else halved_cutout(rgba)
         foreground = rgba[..., 3] > 0
         if not bool(foreground.any()):
             return rgba[:0, :0].clone()
@@ -448,8 +449,7 @@ def hides_image(rgba: Tensor) -> bool:
 
 def _decode(path: Path, mode: str, upright: bool = False) -> np.ndarray:
     """Decode the first image of a file in one of Pillow's modes, turned upright if wanted."""
-    with opened(path, MOST_IMAGE, "an image") as stream:
-        content = io.BytesIO(stream.read())
+    content = io.BytesIO(read_bytes(path, MOST_IMAGE, "an image"))
     _inspect(content, path, mode)
     content.seek(0)
     try:
@@ -484,11 +484,12 @@ def _inspect(stream: BinaryIO, path: Path, mode: str = "RGBA") -> Header:
     if mode == "RGBA" and (has_16_bits or image.mode == "CMYK"):
         got = "16 bits" if has_16_bits else "CMYK"
         raise mismatch(path, "8 bits a channel, grey or RGB", got, "convert the image")
-    header = Header(image.size, image.has_transparency_data, _is_turned(image))
-    try:
+    is_turned = False
+    with suppress(Exception):  # a harmed tag, of what no pixel depends on; of a PNG asking would decode it
+        is_turned = image.format == "JPEG" and image.getexif().get(_ORIENTATION, 1) not in (0, 1)
+    header, is_whole = Header(image.size, image.has_transparency_data, is_turned), False
+    with suppress(Exception):  # OSError, SyntaxError and more
         is_whole = image.verify() is None if image.format == "PNG" else _has_jpeg_end(stream)
-    except Exception:  # OSError, SyntaxError and more
-        is_whole = False
     if not is_whole:
         raise mismatch(path, "a whole image", "a truncated or harmed one", "copy the file again")
     return header
@@ -504,14 +505,6 @@ def _kind_of(stream: BinaryIO) -> tuple[str, str]:
         if head[at:].startswith(marks):
             return kind, "convert it to PNG or JPEG"
     return "another kind of file or a harmed header" if head else "an empty file", ""
-
-
-def _is_turned(image: Image.Image) -> bool:
-    """Tell whether a JPEG's EXIF orientation turns it; of a PNG asking would decode it."""
-    try:
-        return image.format == "JPEG" and image.getexif().get(_ORIENTATION, 1) not in (0, 1)
-    except Exception:  # a harmed tag, of what no pixel depends on
-        return False
 
 
 def _has_jpeg_end(stream: BinaryIO) -> bool:

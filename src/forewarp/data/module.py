@@ -15,7 +15,7 @@ from torch import Tensor
 from forewarp.data import dnerf, hypernerf, multicam, nhr, posed_video
 from forewarp.data.batches import Sampler, Targets, color_of
 from forewarp.data.checks import check_seen
-from forewarp.data.files import RECORD, fingerprint, mismatch, whole
+from forewarp.data.files import RECORD, fingerprint, mismatch, one_of, whole
 from forewarp.data.films import STORE, films_of
 from forewarp.data.images import CACHE
 from forewarp.data.windows import cut
@@ -45,17 +45,15 @@ def hold_out(scene: Scene, count: int) -> Scene:
     """
     if whole(count, "data.held_out", 0) == 0:
         return scene
-    most, frames = most_held_out(scene), _spare(scene)
-    if count > most:
+    kept = {scene.times[0], scene.times[-1], scene.canonical_time} if len(scene.times) > 1 else set()
+    frames = sorted((f.time, i) for i, f in enumerate(scene.train) if f.time not in kept)
+    if count > (most := len(frames) // 2):
         expected = f"at most {most} of the {len(scene.train)} training frames of {scene.name}"
         raise mismatch("data.held_out", expected, count, f"set data.held_out={most}")
     chosen = {frames[(2 * i + 1) * len(frames) // (2 * count)][1] for i in range(count)}
-    return replace(
-        scene,
-        train=tuple(f for i, f in enumerate(scene.train) if i not in chosen),
-        held=tuple(scene.train[i] for i in sorted(chosen)),
-        protocol={**scene.protocol, "held_out": count},
-    )
+    train = tuple(frame for i, frame in enumerate(scene.train) if i not in chosen)
+    held = tuple(scene.train[i] for i in sorted(chosen))
+    return replace(scene, train=train, held=held, protocol={**scene.protocol, "held_out": count})
 
 
 def only(scene: Scene, count: int | None) -> Scene:
@@ -72,17 +70,6 @@ def only(scene: Scene, count: int | None) -> Scene:
     kept = {first, *(order[i] for i in spread(len(order), count - 1))}
     train = tuple(frame for i, frame in enumerate(scene.train) if i in kept)
     return replace(scene, train=train, protocol={**scene.protocol, "train_views": count})
-
-
-def most_held_out(scene: Scene) -> int:
-    """Count the training frames that a scene can spare."""
-    return len(_spare(scene)) // 2
-
-
-def _spare(scene: Scene) -> list[tuple[float, int]]:
-    """List (time, index) of the frames that may be held out: not those at first, last and canonical time."""
-    kept = {scene.times[0], scene.times[-1], scene.canonical_time} if len(scene.times) > 1 else set()
-    return sorted((f.time, i) for i, f in enumerate(scene.train) if f.time not in kept)
 
 
 def with_canonical(scene: Scene, canonical: str | float | None) -> Scene:
@@ -115,9 +102,10 @@ def with_canonical(scene: Scene, canonical: str | float | None) -> Scene:
     if time == scene.canonical_time:
         return scene
     truth = None
-    if scene.truth is not None and bool((scene.truth.times - time).abs().min() < _SAME_TIME):
-        order = ((scene.truth.times - time).abs() >= _SAME_TIME).argsort(stable=True)
-        truth = Truth(scene.truth.points[:, order], scene.truth.times[order])
+    if scene.truth is not None:
+        is_other = (scene.truth.times - time).abs() >= _SAME_TIME
+        order = is_other.argsort(stable=True)
+        truth = None if is_other.all() else Truth(scene.truth.points[:, order], scene.truth.times[order])
     protocol = {**scene.protocol, "canonical_time": time}
     return replace(scene, canonical_time=time, truth=truth, protocol=protocol)
 
@@ -137,11 +125,12 @@ def spread_time(scene: Scene) -> float:
         mask = frame.load()[..., 3] > 127
         step = max(1, min(mask.shape) // _SIDE)
         spreads.append((frame.time, outline(mask[::step, ::step])))
-    first, last = min(spreads)[0], max(spreads)[0]
+    spreads.sort()
+    first, last = spreads[0][0], spreads[-1][0]
     length = max(last - first, _SAME_TIME)
 
     def score(time: float) -> float:
-        near = [value for t, value in sorted(spreads) if abs(t - time) <= _WINDOW * length]
+        near = [value for t, value in spreads if abs(t - time) <= _WINDOW * length]
         return sum(near) / len(near) * (1 - _FAR * abs(2 * (time - first) / length - 1))
 
     return max(scene.times, key=lambda time: round(score(time), 9))
@@ -230,9 +219,8 @@ class SceneDataModule(LightningDataModule):
     def scene(self) -> Scene:
         """The scene; its protocol names the background that it is measured on."""
         self._bound_caches()
-        scene = cut(self._read(), self._window)
-        scene = hold_out(with_canonical(scene, self._canonical), self.held_out)
-        scene = only(scene, self._train_views)
+        scene = with_canonical(cut(self._read(), self._window), self._canonical)
+        scene = only(hold_out(scene, self.held_out), self._train_views)
         check_seen(scene)
         protocol = {**scene.protocol, "background": self._background(scene) if scene.has_alpha else "none"}
         if self.place is not None and any((p / RECORD).is_file() for p in (self.place, self.place.parent)):
@@ -240,9 +228,10 @@ class SceneDataModule(LightningDataModule):
         return replace(scene, protocol=protocol)
 
     def _background(self, scene: Scene) -> str:
-        if self._eval_background is not None or scene.has_alpha:
-            return self._eval_background or "white"
-        return "black" if self._draw["background"] == "random" else self._draw["background"]
+        if self._eval_background is not None:
+            return self._eval_background
+        trained = "white" if scene.has_alpha else self._draw["background"]
+        return "black" if trained == "random" else trained
 
     @cached_property
     def batches(self) -> Sampler:
@@ -254,10 +243,8 @@ class SceneDataModule(LightningDataModule):
         self._bound_caches()
         _ = self.batches
         color_of(self._background(self.scene))
-        parts = (
-            self.scene.test if stage == "test" else (*self.scene.train, *self.scene.held, *self.scene.test)
-        )
-        STORE.fill(films_of(frame.load for frame in parts))
+        trained = () if stage == "test" else (*self.scene.train, *self.scene.held)
+        STORE.fill(films_of(frame.load for frame in (*trained, *self.scene.test)))
 
     def _bound_caches(self) -> None:
         CACHE.resize(self.cache_bytes)
@@ -265,8 +252,7 @@ class SceneDataModule(LightningDataModule):
 
     def targets(self, split: str) -> Targets:
         """Give the whole images of ``train``, ``val``, ``test`` or ``held``."""
-        if split not in ("train", "val", "test", "held"):
-            raise mismatch("split", "train, val, test or held", repr(split))
+        one_of(split, "split", "train", "val", "test", "held")
         color = color_of(self._background(self.scene))
         return Targets(getattr(self.scene, split), color, self.scene.has_alpha, split == "train")
 

@@ -19,24 +19,13 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from forewarp.data.arrays import load_numpy
-from forewarp.data.cameras import MOST_UNITS, box_of, pose_of, space_of
+from forewarp.data.cameras import MOST_UNITS, box_of, length_of, pose_of, smaller, space_of
 from forewarp.data.directions import inverted, other_readings
-from forewarp.data.files import mismatch, number, scene_folder, whole
+from forewarp.data.files import mismatch, number, one_of, scene_folder, whole
 from forewarp.data.films import STORE, Film
-from forewarp.data.images import (
-    CACHE,
-    SUFFIXES,
-    TURN,
-    StoredImage,
-    by,
-    in_order,
-    inspect_image,
-    reduced,
-    turned_by_exif,
-)
+from forewarp.data.images import CACHE, SUFFIXES, TURN, StoredImage, by, exif_turned, in_order, inspect_image
 from forewarp.data.rigs import held_cameras, held_moments, split_rig
 from forewarp.data.video import VIDEOS, extracted, stamps_of
 from forewarp.files import written_whole
@@ -51,19 +40,6 @@ _READINGS = {  # what else may be in a row
     "they are world-to-camera": lambda poses: inverted(poses @ _AXES) @ _AXES,
     "the axes are OpenCV's": lambda poses: poses @ _AXES,
 }
-
-
-@dataclass(frozen=True)
-class _Row:
-    """A row of the file: ``pose`` (4, 4) with OpenCV's axes, ``size`` (width, height), focal length in
-    pixels, and the depths of the nearest and the farthest matter.
-    """
-
-    pose: Tensor
-    size: tuple[int, int]
-    focal: float
-    near: float
-    far: float
 
 
 @dataclass(frozen=True)
@@ -86,17 +62,6 @@ class _Track:
     def name(self, moment: int) -> str:
         """Name a frame by its file or its number."""
         return f"{self.path.stem}/{self.images[moment].stem if self.images else f'{moment:04d}'}"
-
-
-class ReducedImage(StoredImage):
-    """An opaque image whose blocks of ``factor`` x ``factor`` pixels are averaged."""
-
-    def __init__(self, path: Path, size: tuple[int, int], factor: int) -> None:
-        super().__init__(path, size, opaque=True)
-        self.factor = factor
-
-    def _decode(self) -> Tensor:
-        return reduced(super()._decode(), self.factor)
 
 
 def read_scene(
@@ -132,37 +97,36 @@ def read_scene(
     Cost: a pass over each video that decodes its first frame alone; a small read of each image.
     """
     folder = scene_folder(root, scene, "multicam")
-    if not isinstance(normalise, bool):
-        raise mismatch("data.normalise", "true or false", repr(normalise))
+    one_of(normalise, "data.normalise", True, False)
     scale, every = whole(scale, "data.scale", 1), whole(test_every, "data.test_every", 1)
     paths = _paths(folder)
-    rows = _read_rows(folder / FILE, list(paths))
+    whole_cameras = _read_rows(folder / FILE, list(paths))
     tracks = [_look(path) for path in paths.values()]
     count, assumed = _moments(tracks, None if frames is None else whole(frames, "data.frames", 1), folder)
     turned = [path for track in tracks for path in track.images[:count] if path in track.turned]
-    assumed += turned_by_exif(turned, folder)
+    assumed += exif_turned(turned, folder)
     held, moments = held_cameras(test_cameras, list(paths), [0]), held_moments(test_moments, count)
-    factors = [_factor(track, row, scale) for track, row in zip(tracks, rows)]
-    cameras = [_camera(row, scale) for row in rows]
+    factors = [_factor(track, camera, scale) for track, camera in zip(tracks, whole_cameras)]
+    cameras = [smaller(camera, scale) for camera in whole_cameras]
     bytes_of_all = 4 * count * sum(camera.width * camera.height for camera in cameras)
     films = [track.path.name for track in tracks if track.stamps is not None]
     if films and bytes_of_all > CACHE.limit and STORE.limit == 0:
-        line = (
-            f"all frames take {bytes_of_all / 1e9:.3g} GB, more than data.cache_bytes: each is sought in its"
-        )
+        line = f"all frames take {bytes_of_all / 1e9:.3g} GB, more than data.cache_bytes: each is sought in"
         stem = films[0].rsplit(".", 1)[0]
         advice = f"faster are folders of frames, mkdir {stem}; ffmpeg -i {films[0]} {stem}/%04d.png"
-        assumed.append(f"{folder}: {line} film, which takes seconds; {advice}")
+        assumed.append(f"{folder}: {line} its film, which takes seconds; {advice}")
     loads = []
     for track, camera, factor in zip(tracks, cameras, factors):
         if track.stamps is None:
-            loads.append([ReducedImage(path, track.size, factor) for path in track.images[:count]])
+            images = track.images[:count]
+            loads.append([StoredImage(path, track.size, factor, opaque=True) for path in images])
         else:
             size = (camera.width, camera.height)
             loads.append(Film(track.path, track.stamps[:count], size, bytes_of_all).images)
     aslant = max(math.hypot(1, math.hypot(c.width / c.fx, c.height / c.fy) / 2) for c in cameras)
-    near = min(row.near for row in rows) if near is None else number(near, "data.near", 0, MOST_UNITS)
-    far = aslant * max(row.far for row in rows) if far is None else number(far, "data.far", 0, MOST_UNITS)
+    near, far = length_of(near, "data.near"), length_of(far, "data.far")
+    near = min(camera.near for camera in cameras) if near is None else near
+    far = aslant * max(camera.far for camera in cameras) if far is None else far
     given = None if box is None else box_of(box)
     space, seen = space_of(cameras, str(folder / FILE), near=near, far=far, box=given, normalise=normalise)
     cameras = [space.camera(camera) for camera in cameras]
@@ -183,7 +147,7 @@ def read_scene(
         "test_cameras": [list(paths)[k] for k in held],
         "test_moments": sorted(moments),
         "test_frames": len(test),
-        "normalisation": {"center": list(space.center), "scale": space.scale},
+        "normalisation": space.told,
         "near": space.near,
         "far": space.far,
     }
@@ -236,8 +200,8 @@ def _images(folder: Path) -> list[Path]:
     return in_order((path for path in there if path.suffix in SUFFIXES), lambda path: path.name)
 
 
-def _read_rows(path: Path, names: Sequence[str]) -> list[_Row]:
-    """Read and check a row for each camera.
+def _read_rows(path: Path, names: Sequence[str]) -> list[Camera]:
+    """Read the cameras of whole images, their near and far the depths of the nearest and the farthest matter.
 
     Raises:
         SceneError: naming the row, or saying in which other way poses seem to be written.
@@ -250,7 +214,7 @@ def _read_rows(path: Path, names: Sequence[str]) -> list[_Row]:
         expected = f"a row for each of {len(names)} cameras, {names[0]} to {names[-1]}"
         advice = "remove the row or the camera that the other lacks"
         raise mismatch(path, expected, f"{len(array)} rows", advice)
-    rows = []
+    cameras = []
     for k, (name, values) in enumerate(zip(names, np.array(array, np.float64))):
         where = f"{path}: row {k} ({name})"
         block, (near, far) = values[:15].reshape(3, 5), values[15:].tolist()
@@ -260,18 +224,15 @@ def _read_rows(path: Path, names: Sequence[str]) -> list[_Row]:
         if any(side % 1 for side in sizes):
             raise mismatch(f"{where}: height and width", "whole numbers", f"{height:g} and {width:g}")
         focal = number(focal, f"{where}: focal length", 0.01 * width, 100 * width)
-        if (
-            not 0
-            < number(near, f"{where}: near", 0, MOST_UNITS)
-            < number(far, f"{where}: far", 0, MOST_UNITS)
-        ):
+        if not 0 < near < number(far, f"{where}: bounds", 0, MOST_UNITS):
             raise mismatch(f"{where}: bounds", "0 < near < far", f"{near:g} and {far:g}")
-        rows.append(_Row(pose, (int(width), int(height)), focal, near, far))
-    if ways := other_readings([row.pose for row in rows], _READINGS):
+        middle = width / 2, height / 2
+        cameras.append(Camera(int(width), int(height), focal, focal, *middle, pose, near, far))
+    if ways := other_readings([camera.camera_to_world for camera in cameras], _READINGS):
         expected = "[R | T] camera-to-world with the axes down, right, backwards"
         got = f"cameras that look at one thing only if {', or if '.join(ways)}"
         raise mismatch(path, expected, got, "convert them")
-    return rows
+    return cameras
 
 
 def _look(path: Path) -> _Track:
@@ -324,25 +285,18 @@ def _moments(tracks: Sequence[_Track], most: int | None, folder: Path) -> tuple[
     return count, assumed
 
 
-def _factor(track: _Track, row: _Row, scale: int) -> int:
-    """Return by how much a camera's frames are to be reduced."""
-    if any(side % scale for side in row.size):
-        raise mismatch("data.scale", f"a divisor of both sides of {by(row.size)} pixels", scale)
-    fitting = {
-        tuple(side // n for side in row.size): scale // n for n in range(1, scale + 1) if scale % n == 0
-    }
+def _factor(track: _Track, camera: Camera, scale: int) -> int:
+    """Return by how much frames are to be reduced, of which ``camera`` is that of whole ones."""
+    whole = camera.width, camera.height
+    if any(side % scale for side in whole):
+        raise mismatch("data.scale", f"a divisor of both sides of {by(whole)} pixels", scale)
+    divisors = [n for n in range(1, scale + 1) if scale % n == 0]
+    fitting = {tuple(side // n for side in whole): scale // n for n in divisors}
     if track.size not in fitting:
-        smaller = row.size[0] // track.size[0]
-        is_smaller = smaller > 1 and tuple(side // smaller for side in row.size) == track.size
+        smaller = camera.width // track.size[0]
+        is_smaller = smaller > 1 and tuple(side // smaller for side in whole) == track.size
         advice = f"set data.scale={smaller}" if is_smaller else ""
         advice = TURN if track.size[::-1] in fitting else advice
         expected = f"{' or '.join(map(by, fitting))} pixels as {FILE} and data.scale={scale} say"
         raise mismatch(track.path, expected, by(track.size), advice)
     return fitting[track.size]
-
-
-def _camera(row: _Row, scale: int) -> Camera:
-    """Make the camera of images reduced by ``scale``, its near and far 0."""
-    width, height = (side // scale for side in row.size)
-    focal = row.focal / scale
-    return Camera(width, height, focal, focal, width / 2, height / 2, row.pose, 0.0, 0.0)

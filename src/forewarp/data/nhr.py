@@ -20,8 +20,8 @@ import torch
 from forewarp.data.arrays import read_cloud, read_truth, shortened, write_array, write_truth
 from forewarp.data.cameras import box_of, check_middle, pose_of
 from forewarp.data.directions import inverted, opposite, other_readings
-from forewarp.data.files import SceneError, mismatch, numbers_of, opened, remove, scene_folder, whole
-from forewarp.data.images import StoredImage, by, check_pixels, inspect_image, turned_by_exif, write_image
+from forewarp.data.files import SceneError, mismatch, numbers_of, one_of, opened, remove, scene_folder, whole
+from forewarp.data.images import StoredImage, by, check_pixels, exif_turned, inspect_image, write_image
 from forewarp.data.rigs import held_cameras, held_moments, split_rig
 from forewarp.files import decoded, replace_file
 from forewarp.scene.box import Box
@@ -77,8 +77,7 @@ def read_scene(
     Cost: two small reads an image and one of every point.
     """
     folder = scene_folder(root, scene, "nhr")
-    if not isinstance(half_resolution, bool):
-        raise mismatch("data.half_resolution", "true or false", repr(half_resolution))
+    one_of(half_resolution, "data.half_resolution", True, False)
     poses, matrices = _read_poses(folder / "CamPose.inf"), _read_intrinsics(folder / "Intrinsic.inf")
     if len(poses) != len(matrices):
         got = f"{len(matrices)} there and {len(poses)} in CamPose.inf"
@@ -87,7 +86,7 @@ def read_scene(
         raise mismatch(folder / "CamPose.inf", "at least 2 cameras, one to measure", "1")
     tests = max(1, round(len(poses) * 6 / 56))
     spread_out = [i * len(poses) // tests for i in range(tests)]
-    held = held_cameras(test_cameras, [str(k) for k in range(len(poses))], spread_out)
+    held = held_cameras(test_cameras, [*map(str, range(len(poses)))], spread_out)
     every, moments = whole(test_every, "data.test_every", 1), whole(frames, "data.frames", 1)
     there = (path for path in folder.glob("img/*") if path.is_dir() and path.name.isdecimal())
     places = sorted(there, key=lambda path: (int(path.name), path.name))
@@ -109,7 +108,7 @@ def read_scene(
 
     def view(f: int, k: int) -> Frame:
         place, name = places[f], names[k]
-        load = StoredImage(place / name, sizes[k], half_resolution, place / "mask" / name)
+        load = StoredImage(place / name, sizes[k], 1 + half_resolution, place / "mask" / name)
         time = (numbers[f] - numbers[0]) / span
         return Frame(f"{place.name}/{Path(name).stem}", time, cameras[k], load, camera_id=k)
 
@@ -131,7 +130,7 @@ def read_scene(
     if on_disk[0] != 0 or first != 0 or on_disk[-1] - on_disk[0] >= len(on_disk):
         said = f"frames {on_disk[0]} to {on_disk[-1]} ({len(on_disk)}) and cameras from {first}"
         assumed = [f"{folder / 'img'}: {said} taken in order, times by their numbers", *assumed]
-    if assumed := [*assumed, *turned_by_exif(turned, folder / "img")]:
+    if assumed := [*assumed, *exif_turned(turned, folder / "img")]:
         protocol["assumed"] = assumed
     truth = read_truth(folder / "trajectories.npz", 0.0)
     if truth is not None and moments < len(places):  # the file's times are those of all frames on disk
@@ -166,13 +165,12 @@ def write_scene(
             write_image(place / "mask" / name, check_pixels(f"frame {f}: mask/{name}", mask, shape))
         write_array(folder / "pointclouds" / f"frame{f + 1}.npy", frame.points)
     write_truth(folder / "trajectories.npz", trajectories)
-    blocks = [
-        f"{k}\n{c.fx!r} {c.skew!r} {c.cx!r}\n0.0 {c.fy!r} {c.cy!r}\n0.0 0.0 1.0\n\n"
-        for k, c in enumerate(cameras)
-    ]
-    replace_file(folder / "Intrinsic.inf", "".join(blocks))
-    poses = [camera.camera_to_world[:3, _ORDER].double().T.flatten().tolist() for camera in cameras]
-    replace_file(folder / "CamPose.inf", "".join(" ".join(map(repr, pose)) + "\n" for pose in poses))
+    blocks, poses = "", ""
+    for k, c in enumerate(cameras):
+        blocks += f"{k}\n{c.fx!r} {c.skew!r} {c.cx!r}\n0.0 {c.fy!r} {c.cy!r}\n0.0 0.0 1.0\n\n"
+        poses += " ".join(map(repr, c.camera_to_world[:3, _ORDER].T.flatten().tolist())) + "\n"
+    replace_file(folder / "Intrinsic.inf", blocks)
+    replace_file(folder / "CamPose.inf", poses)
 
 
 def _read_poses(path: Path) -> list[np.ndarray]:
@@ -235,14 +233,11 @@ def _lines(path: Path) -> list[tuple[int, list[str]]]:
     return lines
 
 
-def _read_sizes(
-    folders: Sequence[Path], names: Sequence[str], halve: bool
-) -> tuple[list[tuple[int, int]], list[Path]]:
+def _read_sizes(folders: list[Path], names: list[str], halve: bool) -> tuple[list[tuple], list[Path]]:
     """Read the size (width, height) of every camera's images and check that all have it; also list those that
     their EXIF orientation turns.
     """
-    sizes: list[tuple[int, int] | None] = [None] * len(names)
-    turned: list[Path] = []
+    sizes, turned = [None] * len(names), []
     for folder in folders:
         for place in (folder, folder / "mask"):
             if extra := sorted({path.name for path in place.glob("img_*")}.difference(names)):
@@ -265,24 +260,20 @@ def _bounds(folder: Path, numbers: Sequence[int], count: int) -> tuple[Box, list
     A cloud's number is its frame's and 1; as many clouds as frames, of an excerpt, may be in their order,
     which the lines that come with the box say.
     """
-    clouds: dict[int, Path] = {}
-    for path in (*folder.glob("pointclouds/frame*.obj"), *folder.glob("pointclouds/frame*.npy")):  # .npy wins
-        if path.stem[5:].isdecimal():
-            clouds[int(path.stem[5:])] = path
+    paths = (*folder.glob("pointclouds/frame*.obj"), *folder.glob("pointclouds/frame*.npy"))  # .npy wins
+    clouds = {int(path.stem[5:]): path for path in paths if path.stem[5:].isdecimal()}
     chosen = [clouds.get(number + 1, folder / "pointclouds" / f"frame{number + 1}.npy") for number in numbers]
     assumed, are_there = [], all(path.is_file() for path in chosen)
     if not are_there and len(clouds) == count and (numbers[0] != 0 or 0 in clouds):
         chosen = [clouds[number] for number in sorted(clouds)][: len(numbers)]
         said = f"{chosen[0].name} to {chosen[-1].name} ({len(chosen)}) taken in the order of the frames"
         assumed = [f"{folder / 'pointclouds'}: {said}"]
-    corners = []
-    for path in chosen:
-        points = read_cloud(path, 6)[:, :3]
-        corners += [points.min(0), points.max(0)]
-    low, high = np.min(corners, 0).astype(np.float64), np.max(corners, 0).astype(np.float64)
+    clouds = (read_cloud(path, 6)[:, :3] for path in chosen)
+    corners = np.array([(points.min(0), points.max(0)) for points in clouds], np.float64)
+    low, high = corners.min((0, 1)), corners.max((0, 1))
     margin = _PADDING * (high - low)
     try:
-        return Box(tuple((low - margin).tolist()), tuple((high + margin).tolist())), assumed
+        return Box((low - margin).tolist(), (high + margin).tolist()), assumed
     except ValueError as error:
         got = f"{low.tolist()} to {high.tolist()}"
         raise mismatch(folder / "pointclouds", "points that span a box", got, "set data.box") from error

@@ -15,6 +15,8 @@ is nerfstudio's. ``moving_from`` says where masks of motion come from, ``seconds
 
 from __future__ import annotations
 
+import os
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -24,22 +26,14 @@ import numpy as np
 from torch import Tensor
 
 from forewarp.data.arrays import read_cloud, write_array
-from forewarp.data.cameras import MOST_UNITS, SPLITS, box_of, opengl_rows, space_of
-from forewarp.data.depth import (
-    KINDS,
-    LEVELS,
-    MILLIMETRES,
-    SensedDepth,
-    confidence_of,
-    depths_beside,
-    depths_named,
-)
+from forewarp.data.cameras import MOST_UNITS, SPLITS, box_of, length_of, opengl_rows, space_of
+from forewarp.data.depth import LEVELS, MILLIMETRES, SensedDepth, confidence_of, depths_beside, depths_named
 from forewarp.data.directions import check_directions
 from forewarp.data.files import (
-    frames_of,
     inside,
     mismatch,
     number,
+    one_of,
     read_json,
     remove,
     scene_folder,
@@ -57,31 +51,17 @@ from forewarp.data.images import (
     hides_image,
     in_order,
     inspect_image,
-    turned_by_exif,
     write_image,
 )
 from forewarp.data.rigs import held_cameras, held_moments, split_rig
-from forewarp.data.transforms import (
-    camera_of,
-    check_axes,
-    check_times,
-    hold_out_every,
-    left_aside,
-    pose_in,
-    time_in,
-    times_of,
-    unread_times,
-    with_images,
-    with_intrinsics,
-    with_suffix,
-)
+from forewarp.data.transforms import ListedImage, check_times, hold_out_every, image_of, read_frames, times_of
 from forewarp.files import write_json
 from forewarp.scene.box import Box
 from forewarp.scene.camera import Camera
 from forewarp.scene.frame import Frame, Scene, middle_of
 
 FILE, POINTS = "transforms.json", "points.npy"
-MASKS = ("alpha", "ignore", "off")
+
 SCALES = (1, 2, 4, 8)
 _OF_CAMERA = ("w", "h", "fl_x", "fl_y", "cx", "cy", "camera_model", "k1", "k2", "k3", "p1", "p2")
 
@@ -165,20 +145,17 @@ def read_scene(
     Raises:
         SceneError: for every file or value that is missing or wrong, with file and key.
     """
-    check_axes(axes, inverse)
-    if masks not in (None, *MASKS):
-        raise mismatch("data.masks", f"one of {', '.join(MASKS)} or null", repr(masks))
-    if type(scale) is not int or scale not in SCALES:
-        raise mismatch("data.scale", f"one of {SCALES}", repr(scale))
+    one_of(masks, "data.masks", "alpha", "ignore", "off", None)
+    one_of(scale, "data.scale", *SCALES)
     whole(test_every, "data.test_every", 2)
-    if not isinstance(normalise, bool):
-        raise mismatch("data.normalise", "true or false", repr(normalise))
+    one_of(normalise, "data.normalise", True, False)
+    one_of(depth_kind, "data.depth_kind", "metric", "relative", "inverse")
     file = scene_folder(root, scene, "posed_video") / FILE
     content = stated(read_json(file))
     entries, absent, assumed = _read_entries(file, content, scale, axes, inverse, masks)
     if (file.parent / "masks").is_dir() and not any("mask_path" in f for f in content["frames"]):
         assumed.append(f"{file}: masks/ is there, but no frame has a mask_path: they are not used")
-    cut_out = [entry.load for entry in entries if entry.has_alpha]
+    cut_out = [entry.load for entry in entries if entry.is_cut_out]
     premultiplied, told = alpha_of(alpha, [load.path for load in cut_out], file)
     assumed += told
     for load in cut_out:  # none is decoded yet
@@ -196,16 +173,16 @@ def read_scene(
     if not by_name:
         parts, how = _split_entries(file, content, entries, test_every, absent)
     check_times({split: {e.name: given[e.name] for e in part} for split, part in parts.items()}, str(file))
-    near, far = (_length(file, content, key, value) for key, value in (("near", near), ("far", far)))
+    near, far = length_of(near, "data.near"), length_of(far, "data.far")
+    near = length_of(content.get("near"), f"{file}: near") if near is None else near
+    far = length_of(content.get("far"), f"{file}: far") if far is None else far
     bounds = _bounds(file, content, box)
-    shown = (e for e in entries if e.load.mask or (e.has_alpha and bool((e.load()[..., 3] < 255).any())))
+    shown = (e for e in entries if e.load.mask or (e.is_cut_out and bool((e.load()[..., 3] < 255).any())))
     has_alpha = (first := next(shown, None)) is not None
     if has_alpha and masks is None and hides_image(first.load()):
-        advice = (
-            "set data.masks=alpha if that is beside the subject, data.masks=off if alpha means another thing"
-        )
-        got = "an image beneath them too"
-        raise mismatch(first.load.path, "one colour where pixels are transparent", got, advice)
+        expected, got = "one colour where pixels are transparent", "an image beneath them too"
+        advice = "set data.masks=alpha if that is beside the subject, data.masks=off if alpha is of other use"
+        raise mismatch(first.path, expected, got, advice)
     if masks is None and entries[0].valid is not None:
         line = "dark pixels of mask_path are not trained or measured on"
         assumed.append(f"{file}: {line}; if they are beside a subject to cut out, set data.masks=alpha")
@@ -214,15 +191,12 @@ def read_scene(
 
     cloud = _points_of(file, content)
     still = None if cloud is None else space.points(read_cloud(cloud, 3)).float()
-    if depth_kind not in KINDS:
-        raise mismatch("data.depth_kind", f"one of {', '.join(KINDS)}", repr(depth_kind))
     if not isinstance(depth, (str, Path, type(None))):
         raise mismatch("data.depth", "a folder, off or null", repr(depth))
     depths, place = {}, None if depth in (None, "off") else file.parent / depth
     if depth is None:
-        named = {entry.name: entry.depth for entry in parts["train"] if entry.depth is not None}
-        depths, told_of_depths = depths_named(named)
-        assumed += told_of_depths
+        depths, lines = depths_named({e.name: e.depth for e in parts["train"] if e.depth is not None})
+        assumed += lines
     elif place is not None:
         depths = depths_beside(place, [entry.name for entry in parts["train"]])
     if depths and depth_kind != "metric" and still is None:
@@ -241,11 +215,11 @@ def read_scene(
 
     def frame(e: ImageEntry) -> Frame:
         camera_id, camera = None if e.taken_by is None else views.index(e.taken_by), space.camera(e.camera)
-        masks = {"load_valid": e.valid, "load_moving": e.moving, "load_resting": e.resting}
-        return Frame(e.name, e.time, camera, e.load, **masks, camera_id=camera_id, moment=e.moment)
+        beside = {"load_valid": e.valid, "load_moving": e.moving, "load_resting": e.resting}
+        beside["load_sensed"] = sensed(e.name, camera)
+        return Frame(e.name, e.time, camera, e.load, **beside, camera_id=camera_id, moment=e.moment)
 
     train, val, test = (tuple(map(frame, parts[split])) for split in SPLITS)
-    train = tuple(replace(f, load_sensed=sensed(f.name, f.camera)) for f in train)
     ranks = {time: n for n, time in enumerate(sorted({*times}))}
     moments = {e.name: ranks[e.time] if e.moment is None else e.moment for e in entries}
     held = held_cameras(test_cameras, views, []), held_moments(test_moments, max(moments.values()) + 1)
@@ -257,10 +231,10 @@ def read_scene(
     protocol = {
         "dataset": "video_with_poses",
         "resolution": [train[0].camera.width, train[0].camera.height],
-        "times": "as given" if entries[0].time is not None else "from the images' names",
+        "times": "as given" if given[entries[0].name] is not None else "from the images' names",
         "split": how,
         "test_frames": len(test),
-        "normalisation": {"center": list(space.center), "scale": space.scale},
+        "normalisation": space.told,
         "near": space.near,
         "far": space.far,
         "derived": [name for name in ("near", "far", "box") if options[name] is None],
@@ -270,9 +244,8 @@ def read_scene(
     if by_name:
         protocol |= {"test_cameras": [views[k] for k in held[0]], "test_moments": sorted(held[1])}
     if train[0].load_valid is not None:
-        protocol["masks"] = (
-            "ignore: PSNR is of the pixels that count, other metrics see the true colour elsewhere"
-        )
+        line = "ignore: PSNR is of the pixels that count, other metrics see the true colour elsewhere"
+        protocol["masks"] = line
     if train[0].load_moving is not None:
         protocol["moving"] = moving_from
     if "seconds" in content:
@@ -283,10 +256,8 @@ def read_scene(
     if cloud is None and "ply_file_path" in content:
         assumed.append(f"{file}: ply_file_path names no file: there are no points to begin from")
     if still is not None and cloud.suffix == ".ply":
-        assumed.append(
-            f"{cloud}: its {len(still)} points are taken for points that never move; remove it if the "
-            "subject is among them"
-        )
+        line = f"its {len(still)} points are taken for points that never move"
+        assumed.append(f"{cloud}: {line}; remove it if the subject is among them")
     if assumed := [*assumed, *filter(None, [told])]:
         protocol["assumed"] = assumed
     return Scene(scene, train, val, test, seen, start, has_alpha, protocol=protocol, still=still)
@@ -300,17 +271,14 @@ def _points_of(file: Path, content: dict) -> Path | None:
 
 
 @dataclass(frozen=True)
-class ImageEntry:
-    """A checked entry: ``camera`` in the file's units, at the size of the image; its near and far are 0.
-
-    ``name`` is the image's path without its suffix; ``has_alpha`` says whether it may be cut out.
+class ImageEntry(ListedImage):
+    """A checked frame: ``name`` is its path without its suffix; ``is_cut_out`` says whether its own alpha may
+    cut it out.
     """
 
     name: str
-    time: float | None
-    camera: Camera
     load: StoredImage
-    has_alpha: bool
+    is_cut_out: bool
     valid: StoredMask | None = None
     moving: MovingMask | None = None
     resting: MovingMask | None = None
@@ -322,102 +290,74 @@ class ImageEntry:
 def _read_entries(
     file: Path, content: dict, scale: int, axes: str | None, inverse: bool, masks: str | None
 ) -> tuple[list[ImageEntry], set[str], list[str]]:
-    """Read all frames of a nerfstudio-style ``transforms.json`` in its order, less those without an image.
+    """Read all frames of a nerfstudio-style ``transforms.json``; masks that ignore are decoded.
 
     Args:
-        file: for errors and as the place that paths start from.
-        content: content of the file.
-        scale: take images that are ``scale`` times smaller, from ``images_4`` in place of ``images``.
-        axes, inverse, masks: see ``read_scene``.
+        file, content, scale, axes, inverse: as of ``read_frames``.
+        masks: see ``read_scene``.
 
     Returns:
         the entries, the names of those left out, and lines that say what was assumed.
 
     Raises:
         SceneError: for every key or image that is missing or wrong.
-
-    Cost: one read of each PNG, of a JPEG's beginning and end; masks that ignore are decoded.
     """
-    frames, unread = with_intrinsics(frames_of(file, content, content), str(file))
-    images = [_file(entry, "file_path", scale) for entry in frames]
-    there, assumed = with_images(list(zip(frames, images)), images, str(file))
-    absent = {_name_of(file.parent, f.own.get("file_path"), f.where("file_path")) for f in frames}
-    entries, has_mask, turned = [], [], []
-    for entry, image in there:
-        mask, header = None, inspect_image(image)
-        turned += [image] if header.is_turned else []
+    images, assumed = read_frames(file, content, axes=axes, inverse=inverse, scale=scale)
+    entries, has_mask = [], []
+    for image in images:
+        mask, valid, entry, has_alpha = None, None, image.entry, image.header.has_alpha
         if "mask_path" in entry.own and masks != "off":
-            mask = _file(entry, "mask_path", scale)
-            inspect_image(mask, header.size, f" as {image.name}")
-        moving, resting = (
-            _motion(entry, key, image, header.size, scale) for key in ("moving_path", "resting_path")
-        )
-        camera = camera_of(entry, header.size, scale, image, pose=pose_in(entry, axes, inverse))
-        name = _name_of(file.parent, entry.own.get("file_path"), entry.where("file_path"))
-        valid = None
-        if masks == "ignore" and mask is None and not header.has_alpha:
-            raise mismatch(
-                image, "a mask_path or alpha, as data.masks=ignore", "neither", "set data.masks=null"
-            )
+            mask = image_of(entry, "mask_path", scale)
+            inspect_image(mask, image.header.size, f" as {image.path.name}")
+        if masks == "ignore" and mask is None and not has_alpha:
+            expected = "a mask_path or alpha, as data.masks=ignore"
+            raise mismatch(image.path, expected, "neither", "set data.masks=null")
         if masks != "alpha" and (mask or masks == "ignore"):
-            valid = StoredMask(mask or image, header.size, of_alpha=mask is None)
+            valid = StoredMask(mask or image.path, image.header.size, of_alpha=mask is None)
             valid()  # refuses a mask without a bright pixel
         opaque = masks == "off" or (masks == "ignore" and mask is None)
-        load = StoredImage(image, header.size, mask=None if valid else mask, opaque=opaque)
+        load = StoredImage(image.path, image.header.size, mask=None if valid else mask, opaque=opaque)
         has_mask.append(mask is not None)
-        is_cut_out = header.has_alpha and not opaque
+        name = _name_of(file.parent, entry.own["file_path"], entry.where("file_path"))
+        moving, resting = (_motion(image, key, scale) for key in ("moving_path", "resting_path"))
         taken_by = entry.own.get("camera")
         taken_by = str(taken_by) if type(taken_by) in (str, int) else None  # an object is another program's
-        moment = entry.own.get("moment")
-        moment = None if moment is None else whole(moment, entry.where("moment"), 0)
+        moment = whole(entry.own["moment"], entry.where("moment"), 0) if "moment" in entry.own else None
         depth = entry.path("depth_file_path") if "depth_file_path" in entry.own else None
-        beside = valid, moving, resting, taken_by, moment, depth
-        entries.append(ImageEntry(name, time_in(entry), camera, load, is_cut_out, *beside))
+        beside = has_alpha and not opaque, valid, moving, resting, taken_by, moment, depth
+        entries.append(ImageEntry(*vars(image).values(), name, load, *beside))
     for key, given in (
         ("mask_path", has_mask),
         ("moving_path", [e.moving is not None for e in entries]),
         ("camera", [e.taken_by is not None for e in entries]),
         ("moment", [e.moment is not None for e in entries]),
-        ("file_path: alpha", [e.has_alpha or e.load.mask is not None for e in entries]),
+        ("file_path: alpha", [e.is_cut_out or e.load.mask is not None for e in entries]),
     ):
         if any(given) and not all(given):
             got = f"{sum(given)} of {len(given)} and none in frames[{given.index(False)}]"
             raise mismatch(f"{file}: frames: {key}", "one in all frames or in none", got)
-    assumed += unread + turned_by_exif(turned, file) + unread_times(frames, str(file))
     names = [entry.name for entry in entries]
-    if len(set(names)) < len(names):
-        twice = next(name for i, name in enumerate(names) if name in names[:i])
-        raise mismatch(f"{file}: frames", "each image once", f"{twice} twice", "remove one")
+    for name, count in Counter(names).most_common(1):
+        if count > 1:
+            raise mismatch(f"{file}: frames", "each image once", f"{name} twice", "remove one")
     if axes is None:
         check_directions([e.camera.camera_to_world for e in entries], str(file), inverse=inverse)
-    assumed += left_aside(zip((entry for entry, _ in there), (e.camera for e in entries)))
-    return entries, absent - {*names}, assumed
+    listed = {_name_of(file.parent, frame["file_path"], f"{file}: frames") for frame in content["frames"]}
+    return entries, listed - {*names}, assumed
 
 
-def _file(entry, key: str, scale: int) -> Path:
-    """Find the image that a key names, with or without its suffix, ``scale`` times smaller."""
-    folder, where = entry.file.parent, entry.where(key)
-    path = entry.path(key)
-    if scale > 1 and path.parent == folder:
-        raise mismatch(where, "images in a folder", _name_of(folder, path.name, where), "set data.scale=1")
-    if scale > 1:
-        path = path.parent.with_name(f"{path.parent.name}_{scale}") / path.name
-    return with_suffix(path)
-
-
-def _motion(entry, key: str, image: Path, size: tuple[int, int], scale: int) -> MovingMask | None:
-    """Find the mask of which pixels of an image, ``size`` large, move or rest; None without such a key.
+def _motion(image: ListedImage, key: str, scale: int) -> MovingMask | None:
+    """Find the mask of which pixels of an image move or rest; None without such a key.
 
     Raises:
         SceneError: for a mask that is not as large as the image that is not ``scale`` times smaller.
     """
-    if key not in entry.own:
+    if key not in image.entry.own:
         return None
-    mask = MovingMask(_file(entry, key, 1), size)
+    mask, size = MovingMask(image_of(image.entry, key), image.header.size), image.header.size
     found = inspect_image(mask.path).size
     if any(abs(n - big / scale) >= 1 for n, big in zip(size, found)):
-        expected = f"{by(scale * n for n in size)} pixels as {image.name}"
-        raise mismatch(mask.path, expected, by(found))
+        raise mismatch(mask.path, f"{by(scale * n for n in size)} pixels as {image.path.name}", by(found))
     return mask
 
 
@@ -446,11 +386,12 @@ def _split_entries(
     listed = [split for split in SPLITS if f"{split}_filenames" in content]
     if listed:
         names = {split: _listed(file, content, f"{split}_filenames", entries, absent) for split in listed}
-        if sum(map(len, names.values())) > len(set().union(*names.values())):
+        everywhere = set().union(*names.values())
+        if sum(map(len, names.values())) > len(everywhere):
             raise mismatch(file, "lists of filenames that share none", "one in two of them")
         parts = {split: [e for e in entries if e.name in names.get(split, ())] for split in SPLITS}
         for home in [split for split in ("train", "test") if split not in listed][:1]:
-            parts[home] = [e for e in entries if not any(e.name in split for split in names.values())]
+            parts[home] = [entry for entry in entries if entry.name not in everywhere]
         how = "as listed in the file"
         if not parts["test"] and names.get("test") and names["test"] <= absent:  # never rendered
             parts["train"], parts["test"] = hold_out_every(parts["train"], test_every)
@@ -477,19 +418,12 @@ def _listed(file: Path, content: dict, key: str, entries: list[ImageEntry], abse
     return names
 
 
-def _length(file: Path, content: dict, key: str, value: float | None) -> float | None:
-    """Take near or far, in the file's units, from the config, else from the file, else None."""
-    where = f"{file}: {key}" if value is None else f"data.{key}"
-    value = content.get(key) if value is None else value
-    least = 0.0 if key == "near" else 1 / MOST_UNITS
-    return None if value is None else number(value, where, least, MOST_UNITS)
-
-
 def _bounds(file: Path, content: dict, box: Sequence[float] | None) -> Box | None:
     """Take the box, in the file's units, from the config, else from the file, else None."""
-    corners = content.get("aabb")
-    if box is not None or corners is None:
-        return None if box is None else box_of(box)
+    if box is not None:
+        return box_of(box)
+    if (corners := content.get("aabb")) is None:
+        return None
     try:
         return Box(*(tuple(number(v, "aabb", -MOST_UNITS, MOST_UNITS) for v in corner) for corner in corners))
     except (TypeError, ValueError) as error:
@@ -524,17 +458,17 @@ def write_scene(
     """
     folder = Path(folder)
     remove(folder, FILE, POINTS, "confidence/**/*.npy")  # which is read wherever a depth is
-    entries, lists, taken = [], {split: [] for split in SPLITS}, set()
+    entries, lists, taken = [], {split: [] for split in ("", *SPLITS)}, set()
     for shot in shots:
-        entries.append(_write_shot(folder, shot, taken) | ({} if mask is None else {"mask_path": mask}))
-        if shot.split:
-            lists[shot.split].append(entries[-1]["file_path"])
+        entries.append(_write_shot(folder, shot, taken) | stated({"mask_path": mask}))
+        lists[shot.split].append(entries[-1]["file_path"])
     common = {key: entries[0][key] for key in _OF_CAMERA if entries and key in entries[0]}
     common = {key: value for key, value in common.items() if all(e.get(key) == value for e in entries)}
-    told = {"near": near, "far": far, "seconds": seconds, "moving_from": moving_from}
-    content = {**common, **{f"{split}_filenames": names for split, names in lists.items() if names}}
-    content |= {key: value for key, value in told.items() if value is not None}
-    content |= {} if aabb is None else {"aabb": [aabb.low, aabb.high]}
+    content = {**common, **{f"{split}_filenames": lists[split] for split in SPLITS if lists[split]}}
+    corners = None if aabb is None else [aabb.low, aabb.high]
+    content |= stated(
+        {"near": near, "far": far, "seconds": seconds, "moving_from": moving_from, "aabb": corners}
+    )
     content["frames"] = [{k: v for k, v in entry.items() if k not in common} for entry in entries]
     write_array(folder / POINTS, points if points is not None and len(points) else None)
     write_json(folder / FILE, content)
@@ -542,19 +476,19 @@ def write_scene(
 
 def _write_shot(folder: Path, shot: PosedShot, taken: set[str]) -> dict:
     """Write an image and make its entry; ``taken`` are the names so far, to which this one's is added."""
-    camera, suffix, is_png = shot.camera, Path(shot.name).suffix, shot.name.lower().endswith(".png")
+    camera, stem, suffix = shot.camera, *os.path.splitext(shot.name)
     name = _name_of(folder, f"images/{shot.name}", f"shots: {shot.name!r}")
-    if suffix not in SUFFIXES:
-        raise mismatch(shot.name, f"a name in {', '.join(SUFFIXES)}", repr(suffix))
+    one_of(suffix, f"{shot.name}: suffix", *SUFFIXES)
     if name in taken:
         raise mismatch(shot.name, "names that differ without their suffix", "two alike")
     taken.add(name)
-    if shot.split not in ("", *SPLITS):
-        raise mismatch(shot.name, f"a split of {', '.join(SPLITS)}", repr(shot.split))
+    if shot.split:
+        one_of(shot.split, f"{shot.name}: split", *SPLITS)
     if camera.skew:
         raise mismatch(shot.name, "a camera without skew", f"a skew of {camera.skew:g}")
     shapes = [(camera.height, camera.width, channels) for channels in (3, 4)]
-    pixels = check_pixels(shot.name, shot.pixels, *shapes[: 2 if is_png else 1])  # a JPEG has no alpha
+    channels = 2 if suffix.lower() == ".png" else 1  # a JPEG has no alpha
+    pixels = check_pixels(shot.name, shot.pixels, *shapes[:channels])
     entry = {"file_path": f"images/{shot.name}", "w": camera.width, "h": camera.height, "fl_x": camera.fx}
     entry |= {"fl_y": camera.fy, "cx": camera.cx, "cy": camera.cy, "camera_model": "OPENCV"}
     if camera.lens is not None:
@@ -562,21 +496,17 @@ def _write_shot(folder: Path, shot: PosedShot, taken: set[str]) -> dict:
     if shot.time is not None:
         entry["time"] = number(shot.time, f"{shot.name}: time", 0, 1)
     entry["transform_matrix"] = opengl_rows(camera.camera_to_world, shot.name)
-    if shot.taken_by is not None:
-        entry["camera"] = shot.taken_by
-    if shot.moment is not None:
-        entry["moment"] = shot.moment
+    entry |= stated({"camera": shot.taken_by, "moment": shot.moment})
     write_image(folder / entry["file_path"], pixels)
     if shot.depth is not None:
-        entry["depth_file_path"] = f"depth/{shot.name.removesuffix(suffix)}.npy"
+        entry["depth_file_path"] = f"depth/{stem}.npy"
         write_array(folder / entry["depth_file_path"], shot.depth)
     if shot.confidence is not None:
         trust = np.asarray(shot.confidence)
-        trust = trust / LEVELS if trust.dtype.kind in "iu" else trust
-        write_array(folder / f"confidence/{shot.name.removesuffix(suffix)}.npy", trust)
+        write_array(folder / f"confidence/{stem}.npy", trust / LEVELS if trust.dtype.kind in "iu" else trust)
     for kind, mask in (("moving", shot.moving), ("resting", shot.resting)):
         if mask is not None:
             mask = np.uint8(255) * np.asarray(mask, bool)
-            entry[f"{kind}_path"] = f"{kind}/{shot.name.removesuffix(suffix)}.png"
+            entry[f"{kind}_path"] = f"{kind}/{stem}.png"
             write_image(folder / entry[f"{kind}_path"], check_pixels(shot.name, mask, shapes[0][:2]))
     return entry

@@ -12,9 +12,7 @@ from forewarp.scene.frame import Frame
 _SHOWN = 6  # names of cameras in an error
 
 
-def held_cameras(
-    wanted: Sequence[str | int] | None, names: Sequence[str], default: Iterable[int]
-) -> list[int]:
+def held_cameras(wanted: Sequence[str | int] | None, names: list[str], default: Iterable[int]) -> list[int]:
     """Find the cameras to hold out, their ascending places in ``names``.
 
     Args:
@@ -31,13 +29,13 @@ def held_cameras(
     if wanted is None:
         return sorted(default)
     are_names = isinstance(wanted, Sequence) and not isinstance(wanted, str)
-    texts = [str(name) for name in wanted] if are_names else [""]
-    if not {*texts} <= {*names} or len({*texts}) < len(texts) or len(texts) >= len(names):
+    texts = [str(name) for name in wanted] if are_names else []
+    unknown = [text for text in texts if text not in names]
+    if not are_names or unknown or len({*texts}) < len(texts) or len(texts) >= len(names):
         there = ", ".join(names) if len(names) <= _SHOWN else f"{names[0]}, {names[1]} .. {names[-1]}"
-        unknown = [text for text in texts if text and text not in names]
         got = f"no camera {unknown[0]}" if unknown else short(wanted)
         raise mismatch("data.test_cameras", f"some of the cameras {there}, not all", got)
-    return sorted(names.index(text) for text in texts)
+    return sorted(map(names.index, texts))
 
 
 def held_moments(wanted: Sequence[int] | None, count: int) -> frozenset[int]:
@@ -46,12 +44,11 @@ def held_moments(wanted: Sequence[int] | None, count: int) -> frozenset[int]:
     >>> sorted(held_moments([3, 1], 5))
     [1, 3]
     """
-    are_numbers = wanted is None or (
-        isinstance(wanted, Sequence) and all(type(n) is int and 0 <= n < count for n in wanted)
-    )
-    if not are_numbers or len({*(wanted or ())}) >= count:
+    moments = () if wanted is None else wanted
+    are_numbers = isinstance(moments, Sequence) and all(type(n) is int and 0 <= n < count for n in moments)
+    if not are_numbers or len({*moments}) >= count:
         raise mismatch("data.test_moments", f"numbers of 0 to {count - 1}, not all", short(wanted))
-    return frozenset(wanted or ())
+    return frozenset(moments)
 
 
 def split_rig(

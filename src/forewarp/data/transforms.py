@@ -12,7 +12,7 @@ import math
 import os
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from reprlib import repr as short
 from typing import TypeVar
@@ -21,40 +21,21 @@ import numpy as np
 import torch
 
 from forewarp.data.cameras import FLIP, check_lens, check_middle, pose_of
-from forewarp.data.files import Entry, mismatch, nearly
-from forewarp.data.images import SUFFIXES, TURN, by, in_order, name_parts
+from forewarp.data.files import Entry, frames_of, mismatch, nearly, one_of
+from forewarp.data.images import SUFFIXES, TURN, Header, by, exif_turned, in_order, inspect_image, name_parts
 from forewarp.scene.camera import Camera, Lens
 
 Thing = TypeVar("Thing")
 MODELS = ("OPENCV", "PINHOLE", "RADIAL", "SIMPLE_RADIAL", "SIMPLE_PINHOLE")
-AXES = ("opengl", "opencv")
 # Keys of programs that say that the lens is none of these, whatever k1 .. say, or say which it is.
-_OTHER_LENSES = (
-    "is_fisheye",
-    "fisheye",
-    "ftheta_p0",
-    "latlong",
-    "equirectangular",
-    "panorama",
-    "orthographic",
-)
-_NAMES_LENS = re.compile(
-    r"((camera|lens|distortion|projection)_?)?(model|type|projection|lens)", re.IGNORECASE
-)
+_LENSES = ("is_fisheye", "fisheye", "ftheta_p0", "latlong", "equirectangular", "panorama", "orthographic")
+_NAMES_LENS = re.compile(r"(?i)((camera|lens|distortion|projection)_?)?(model|type|projection|lens)")
 _NO_PINHOLE = re.compile(
-    "fish|equi(dist|rect|sol)|pano|spheric|omnidir|ortho|lat_?long|cylind|kannala|thin_?prism|ftheta",
-    re.IGNORECASE,
+    "(?i)fish|equi(dist|rect|sol)|pano|spheric|omnidir|ortho|lat_?long|cylind|kannala|thin_?prism|ftheta"
 )
 _UNREAD_LENSES = ("distortion_params", "distortion", "dist_coeffs", "distortion_coefficients", "dist")
-_MATRICES = (  # of intrinsics, as programs call them
-    "cam_K",
-    "K",
-    "intrinsics",
-    "intrinsic",
-    "intrinsic_matrix",
-    "camera_intrinsics",
-    "camera_matrix",
-)
+# Matrices of intrinsics, as programs call them.
+_INNER = ("cam_K", "K", "intrinsics", "intrinsic", "intrinsic_matrix", "camera_intrinsics", "camera_matrix")
 _FOCAL = ("fl_x", "fl_y", "camera_angle_x")
 _SAME_FOCAL = 0.02  # share by which two focal lengths of one camera may differ
 _OUTSIDE = 0.9  # share of a side beyond which a principal point is another image's
@@ -65,6 +46,75 @@ _LEAST_UNIT = 0.5  # of all times, that those in [0, 1] span
 _ROUNDING = 1e-6  # beyond 0 and 1
 _FRAME_WORD = re.compile(r"frame[_-]?$", re.IGNORECASE)
 _CAMERA_WORDS = re.compile(r"(cam|camera|view|sensor|c|v)[_-]?$", re.IGNORECASE)
+
+
+@dataclass(frozen=True)
+class ListedImage:
+    """A frame of a file whose image is there: ``camera`` in the file's units, at the size of the image, its
+    near and far 0; ``time`` in any unit, None where the frame has none.
+    """
+
+    entry: Entry
+    path: Path
+    header: Header
+    camera: Camera
+    time: float | None
+
+
+def read_frames(
+    file: Path,
+    content: dict,
+    *,
+    axes: str | None,
+    inverse: bool,
+    scale: int = 1,
+    longer: bool = False,
+    optional: bool = False,
+) -> tuple[list[ListedImage], list[str]]:
+    """Read all frames of a file in its order, less those without an image.
+
+    Args:
+        file: for errors and as the place that paths start from.
+        content: content of the file.
+        axes, inverse: of its poses, see ``pose_in``.
+        scale: take images that are ``scale`` times smaller, from ``images_4`` in place of ``images``.
+        longer: see ``camera_of``.
+        optional: no image need be there.
+
+    Returns:
+        the frames, and lines that say what was assumed.
+
+    Raises:
+        SceneError: for every key or image that is missing or wrong.
+
+    Cost: one read of each PNG, of a JPEG's beginning and end.
+    """
+    entries, unread = with_intrinsics(frames_of(file, content, content), str(file))
+    paths = [image_of(entry, "file_path", scale) for entry in entries]
+    if optional and not any(map(os.path.isfile, paths)):
+        return [], [f"{file}: none of its {len(paths)} images is there: left out", *unread]
+    there, assumed = with_images(list(zip(entries, paths)), paths, str(file))
+    images = []
+    for entry, path in there:
+        header, pose = inspect_image(path), pose_in(entry, axes, inverse)
+        camera = camera_of(entry, header.size, scale, path, pose=pose, longer=longer)
+        time = entry.number("time", -_MOST_TIME, _MOST_TIME) if "time" in entry.own else None
+        images.append(ListedImage(entry, path, header, camera, time))
+    assumed += unread + exif_turned([image.path for image in images if image.header.is_turned], file)
+    keys = [] if any("time" in entry.own for entry in entries) else _TIMES
+    like_times = [key for key in keys if all(type(entry.own.get(key)) in (int, float) for entry in entries)]
+    for key in like_times[:1]:
+        assumed.append(f"{file}: {key} of the frames is not read; call it time, if it is that")
+    return images, assumed + left_aside((image.entry, image.camera) for image in images)
+
+
+def image_of(entry: Entry, key: str, scale: int = 1) -> Path:
+    """Find the image that a key names, with or without its suffix, ``scale`` times smaller."""
+    path = entry.path(key)
+    if scale > 1 and path.parent == entry.file.parent:
+        raise mismatch(entry.where(key), "images in a folder", path.stem, "set data.scale=1")
+    folder = path.parent if scale == 1 else path.parent.with_name(f"{path.parent.name}_{scale}")
+    return with_suffix(folder / path.name)
 
 
 def camera_of(
@@ -91,9 +141,7 @@ def camera_of(
             with Brown's distortion or cannot be undone, and for intrinsics of a larger image.
     """
     model = entry.get("camera_model", "OPENCV")
-    if model not in MODELS:
-        expected = f"one of {', '.join(MODELS)}"
-        raise mismatch(entry.where("camera_model"), expected, short(model), "undistort the images")
+    one_of(model, entry.where("camera_model"), *MODELS, advice="undistort the images")
     check_pinhole(entry)
     sizes = [entry.number(key, 1, 1e6, n * scale) for key, n in zip("wh", stored)]
     if any(abs(n - size / scale) >= 1 for n, size in zip(stored, sizes)):
@@ -132,7 +180,7 @@ def check_pinhole(entry: Entry) -> None:
         SceneError: naming the key.
     """
     for key, value in {**entry.common, **entry.own}.items():
-        is_other = key in _OTHER_LENSES and value not in (None, False, 0)
+        is_other = key in _LENSES and value not in (None, False, 0)
         if isinstance(value, str) and _NAMES_LENS.fullmatch(key):
             is_other = _NO_PINHOLE.search(value) is not None
         if is_other:
@@ -184,7 +232,7 @@ def with_intrinsics(entries: Sequence[Entry], where: str) -> tuple[list[Entry], 
         parts = {}
         for place in ("own", "common"):
             keys = getattr(entry, place)
-            key = next((key for key in _MATRICES if _intrinsics(keys.get(key)) is not None), None)
+            key = next((key for key in _INNER if _intrinsics(keys.get(key)) is not None), None)
             if key is not None:
                 values = dict(zip(("fl_x", "fl_y", "cx", "cy"), _intrinsics(keys[key])))
                 off = [k for k, v in values.items() if abs(_as_number(keys.get(k), v) / v - 1) > _SAME_FOCAL]
@@ -193,12 +241,11 @@ def with_intrinsics(entries: Sequence[Entry], where: str) -> tuple[list[Entry], 
                 parts[place] = {**({} if off else values), **keys}
         read.append(replace(entry, **parts) if parts else entry)
     for key, value in {**entries[0].common, **entries[0].own}.items():
-        is_read = key in _MATRICES and _intrinsics(value) is not None
-        is_other = key in _MATRICES and key not in told and isinstance(value, (list, dict)) and not is_read
-        if is_other or (key not in _MATRICES and _intrinsics(value) is not None):
-            told[key] = (
-                f"{where}: {key} is not read, which seems to be intrinsics; write it as fl_x fl_y cx cy"
-            )
+        is_read = key in _INNER and _intrinsics(value) is not None
+        is_other = key in _INNER and key not in told and isinstance(value, (list, dict)) and not is_read
+        if is_other or (key not in _INNER and _intrinsics(value) is not None):
+            line = f"{key} is not read, which seems to be intrinsics; write it as fl_x fl_y cx cy"
+            told[key] = f"{where}: {line}"
     return read, list(told.values())
 
 
@@ -244,18 +291,6 @@ def left_aside(cameras: Iterable[tuple[Entry, Camera]]) -> list[str]:
     return []
 
 
-def time_in(entry: Entry) -> float | None:
-    """Read a frame's ``time``, in any unit; None where it has none."""
-    return entry.number("time", -_MOST_TIME, _MOST_TIME) if "time" in entry.own else None
-
-
-def unread_times(entries: Sequence[Entry], where: str) -> list[str]:
-    """Say in a line that frames have no ``time``, but another key that may be one."""
-    keys = [] if any("time" in entry.own for entry in entries) else _TIMES
-    there = [key for key in keys if all(type(entry.own.get(key)) in (int, float) for entry in entries)]
-    return [f"{where}: {there[0]} of the frames is not read; call it time, if it is that"] if there else []
-
-
 def pose_in(entry: Entry, axes: str | None, inverse: bool) -> torch.Tensor:
     """Read a frame's ``transform_matrix``: camera-to-world (4, 4) float64 with OpenCV's axes.
 
@@ -265,22 +300,16 @@ def pose_in(entry: Entry, axes: str | None, inverse: bool) -> torch.Tensor:
         inverse: the file's matrix is world-to-camera.
 
     Raises:
-        SceneError: for no matrix of a pose, or one in the axes of Mitsuba.
+        SceneError: for another of ``axes`` or ``inverse``, for no matrix of a pose, or one in Mitsuba's axes.
     """
+    one_of(axes, "data.axes", "opengl", "opencv", None)
+    one_of(inverse, "data.inverse", True, False)
     if entry.get("from_mitsuba"):
         advice = "negate the first and the third column of each transform_matrix, and remove the key"
         raise mismatch(entry.where("from_mitsuba"), "poses in OpenGL's axes", "those of Mitsuba", advice)
     pose = pose_of(entry.own.get("transform_matrix"), entry.where("transform_matrix"))
     pose = np.linalg.inv(pose) if inverse else pose
     return torch.from_numpy(pose if axes == "opencv" else pose @ FLIP)
-
-
-def check_axes(axes: object, inverse: object) -> None:
-    """Refuse values of ``data.axes`` and ``data.inverse`` that ``pose_in`` does not know."""
-    if axes is not None and axes not in AXES:
-        raise mismatch("data.axes", f"{' or '.join(AXES)}, or null", repr(axes))
-    if not isinstance(inverse, bool):
-        raise mismatch("data.inverse", "true or false", repr(inverse))
 
 
 def with_suffix(path: Path) -> Path:
@@ -329,9 +358,7 @@ def with_images(things: Sequence[Thing], images: Sequence[Path], where: str) -> 
     return [thing for thing, is_there in zip(things, there) if is_there], [line]
 
 
-def times_of(
-    names: Sequence[str], times: Sequence[float | None], where: str
-) -> tuple[list[float], str | None]:
+def times_of(names: list[str], times: Sequence[float | None], where: str) -> tuple[list[float], str | None]:
     """Give each image a time in [0, 1], where the file has none by the numbers in the images' names.
 
     Where folders or names tell several cameras apart, images of one number share a time. Times in the file

@@ -31,7 +31,11 @@ def cut(scene: Scene, window: Sequence[float] | None) -> Scene:
         return scene
     begin, end = limits_of(window)
     times = scene.instants
-    inside = [i for i, time in enumerate(times) if _holds(begin, end, time)]
+
+    def holds(time: float) -> bool:
+        return begin <= time < end or (time == 1 and end == 1)
+
+    inside = [i for i, time in enumerate(times) if holds(time)]
     if len(inside) < _FEWEST:
         expected = f"a window with at least {_FEWEST} of the film's {len(times)} instants"
         raise mismatch("data.window", expected, f"{len(inside)} in [{begin:g}, {end:g}]", "use fewer windows")
@@ -39,16 +43,12 @@ def cut(scene: Scene, window: Sequence[float] | None) -> Scene:
     last = times[min(inside[-1] + OVERLAP, len(times) - 1)]
     first, last = min(first, begin), max(last, end)  # test frames may lie before and after all others
 
-    def kept(frames: Sequence[Frame], begin: float, end: float) -> tuple[Frame, ...]:
-        return tuple(
-            replace(frame, time=min(max((frame.time - first) / (last - first), 0.0), 1.0))
-            for frame in frames
-            if _holds(begin, end, frame.time)
-        )
+    def moved(frames: Sequence[Frame]) -> tuple[Frame, ...]:
+        return tuple(replace(frame, time=(frame.time - first) / (last - first)) for frame in frames)
 
-    train = tuple(replace(f, time=(f.time - first) / (last - first)) for f in scene.train)
-    train = tuple(frame for frame in train if 0 <= frame.time <= 1)
-    others = {name: kept(getattr(scene, name), begin, end) for name in ("val", "test", "held")}
+    train = tuple(frame for frame in moved(scene.train) if 0 <= frame.time <= 1)
+    others = {name: getattr(scene, name) for name in ("val", "test", "held")}
+    others = {name: moved(f for f in frames if holds(f.time)) for name, frames in others.items()}
     protocol = scene.protocol | {"window": [begin, end], "span": [first, last]}
     if "test_frames" in protocol:
         protocol["test_frames"] = len(others["test"])
@@ -68,7 +68,3 @@ def limits_of(window: Sequence[float]) -> tuple[float, float]:
     if not is_pair or not all(type(x) in (int, float) for x in window) or not 0 <= window[0] < window[1] <= 1:
         raise mismatch("data.window", "from and to in [0, 1], as [0.25, 0.5]", repr(window))
     return float(window[0]), float(window[1])
-
-
-def _holds(begin: float, end: float, time: float) -> bool:
-    return begin <= time < end or (time == 1 and end == 1)

@@ -162,6 +162,17 @@ class Camera:
         """Camera centre (3,), float64, world units."""
         return self.camera_to_world[:3, 3]
 
+    @property
+    def inner(self) -> tuple[int | float | Lens | None, ...]:
+        """What makes an image but pose and range, for ``at_origin``: it can be compared and hashed."""
+        return self.width, self.height, self.fx, self.fy, self.cx, self.cy, self.skew, self.lens
+
+    @staticmethod
+    def at_origin(width, height, fx, fy, cx, cy, skew, lens) -> Camera:
+        """Make a camera of this ``inner`` whose axes are the world's, of the range 0 to 1."""
+        pose = torch.eye(4, dtype=torch.float64)
+        return Camera(width, height, fx, fy, cx, cy, pose, 0.0, 1.0, skew, lens)
+
     def rays(self, pixels: Vector | None = None, dtype: torch.dtype = torch.float32) -> Rays:
         """Make rays through pixel centres.
 

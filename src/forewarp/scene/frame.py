@@ -166,15 +166,15 @@ def sightings(points: Tensor, cameras: list[Camera], masks: list[Tensor]) -> tup
     """
     covered, seen = torch.zeros(2, len(points), dtype=torch.int32)
     for camera, mask in zip(cameras, masks, strict=True):
-        row, column, visible = _pixels(camera, points)
+        row, column, visible = where_seen(camera, points)
         on = mask[row.clamp(0, camera.height - 1), column.clamp(0, camera.width - 1)]
         covered += (visible & on).int()
         seen += visible.int()
     return covered, seen
 
 
-def _pixels(camera: Camera, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return row and column (N,) of the pixel that shows each point, and whether the image has it."""
+def where_seen(camera: Camera, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Return row and column (N,) of the pixel that shows each point (N, 3), and whether the image has it."""
     pixel, z = camera.project(points)
     column, row = pixel.floor().long().unbind(-1)
     return row, column, (z > 0) & (column >= 0) & (row >= 0) & (column < camera.width) & (row < camera.height)
@@ -246,7 +246,7 @@ def _disagreement(scene: Scene, frames: Sequence[Frame]) -> float:
     masks = [dilate(foreground, pixels) for foreground, pixels in zip(foregrounds, reach)]
     points, missed = points[visual_hull(points, [frame.camera for frame in frames], masks)], 0
     for frame, foreground, pixels in zip(frames, foregrounds, reach):
-        row, column, inside = _pixels(frame.camera, points)
+        row, column, inside = where_seen(frame.camera, points)
         covered = torch.zeros_like(foreground)
         covered[row[inside], column[inside]] = True
         missed += int((foreground & ~dilate(covered, pixels)).sum())

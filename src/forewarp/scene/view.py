@@ -125,6 +125,12 @@ class Asks:
             raise ValueError(f"asks: expected {expected}, but got {self}")
 
 
+def _moved(record, device):
+    """Move the tensors of a record to another device."""
+    tensors = {name: value for name, value in vars(record).items() if isinstance(value, Tensor)}
+    return replace(record, **{name: tensor.to(device) for name, tensor in tensors.items()})
+
+
 @dataclass(frozen=True)
 class Observation:
     """Pixels of one image: the true ``rgb`` (R, 3) in [0, 1] over ``background`` (3,) or (R, 3), the colour
@@ -145,9 +151,7 @@ class Observation:
 
     def to(self, device) -> Observation:
         """Move what is known of the pixels to another device; the view stays on the CPU."""
-        names = ("rgb", "background", "valid", "sensed")
-        known = {name: getattr(self, name) for name in names if getattr(self, name) is not None}
-        return replace(self, **{name: tensor.to(device) for name, tensor in known.items()})
+        return _moved(self, device)
 
     def smaller(self, times: float) -> Observation:
         """Average a whole image of ``straight`` pixels to one about so many times smaller: colours by their
@@ -255,6 +259,4 @@ class Target:
 
     def to(self, device) -> Target:
         """Move the tensors to another device."""
-        names = ("rgb", "background", "foreground", "depth", "valid", "moving", "covisible")
-        known = {name: getattr(self, name) for name in names if getattr(self, name) is not None}
-        return replace(self, **{name: tensor.to(device) for name, tensor in known.items()})
+        return _moved(self, device)

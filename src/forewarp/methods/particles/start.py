@@ -320,8 +320,7 @@ def _small(frames: Sequence[Frame], side: int, i: int) -> tuple[Tensor, Tensor, 
     planes = torch.nn.functional.interpolate(planes, size, mode="area")
     camera, inside = camera.resized(size[1], size[0]), torch.ones(size, dtype=torch.bool)
     if camera.lens is not None:
-        inner = camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy, camera.skew
-        places = _bent_pixels(*inner, camera.lens)
+        places = _bent_pixels(*camera.inner)
         planes = torch.nn.functional.grid_sample(planes, places, padding_mode="border", align_corners=False)
         camera, inside = replace(camera, lens=None), (places[0].abs() <= 1).all(-1)
     learned = inside if valid is None else inside & (planes[0, 3] > _WHOLLY)
@@ -329,14 +328,14 @@ def _small(frames: Sequence[Frame], side: int, i: int) -> tuple[Tensor, Tensor, 
 
 
 @lru_cache(maxsize=8)
-def _bent_pixels(width: int, height: int, *inner: float | Lens) -> Tensor:
+def _bent_pixels(*inner: float | Lens) -> Tensor:
     """Return where a lens puts the pixels of an image without it (1, H, W, 2), in [-1, 1]; once for all
-    images of a camera, as looking for where a lens folds takes a tenth of a second.
+    images of a camera with this ``inner``, as looking for where a lens folds takes a tenth of a second.
     """
-    fx, fy, cx, cy, skew, lens = inner
-    camera = Camera(width, height, fx, fy, cx, cy, torch.eye(4, dtype=torch.float64), 0.0, 1.0, skew, lens)
+    camera = Camera.at_origin(*inner)
     pixel, _ = camera.project(replace(camera, lens=None).rays(dtype=torch.float64).directions)
-    return (2 * pixel / torch.tensor([width, height]) - 1).float().reshape(1, height, width, 2)
+    size = torch.tensor([camera.width, camera.height])
+    return (2 * pixel / size - 1).float().reshape(1, camera.height, camera.width, 2)
 
 
 def _sweep(
