@@ -357,10 +357,8 @@ def show(metrics: dict, folder: Path, absent: dict[str, str]) -> None:
     console.print(table_of(metrics))
     others = ("train", "render_per_frame", "render_again_per_frame")
     stages = ", ".join(f"{name} {time_text(s)}" for name, s in seconds.items() if name not in others)
-    lines = [
-        f"trained {time_text(seconds['train'])} ({stages}), {seconds['render_per_frame']:.3g} s a frame, "
-        f"{seconds['render_again_per_frame']:.3g} s another at the same time"
-    ]
+    spent, frame, again = time_text(seconds["train"]), *(f"{seconds[name]:.3g} s" for name in others[1:])
+    lines = [f"trained {spent} ({stages}), {frame} a frame, {again} another at the same time"]
     if flow and flow["epe_moving"] is not None:
         error, motion = flow["epe_moving"], flow["motion_mean"]
         share = f"{error / motion:.0%} of their motion {motion:.4f}"
