@@ -9,7 +9,7 @@ import math
 import re
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import product
+from itertools import chain, product
 from pathlib import Path
 from statistics import fmean
 from typing import NamedTuple
@@ -22,13 +22,12 @@ from forewarp.metrics.gain import Estimate, pooled_deviation
 from forewarp.metrics.registry import metric_of
 from forewarp.report import figures
 from forewarp.report.choices import every_run
-from forewarp.report.results import COUNTERPART, KINDS, Point, Row, Runs, portable, read_runs
+from forewarp.report.results import KINDS, Point, Row, Runs, portable, read_runs
 from forewarp.report.tables import Cell, Column, Difference, Section, Table, rendered
 
 PAPER = Path(__file__).with_name("paper.yaml")  # the printed numbers
 # What the runs of one row of a table have in common.
-BUDGET = ("preset", "minutes", "iterations", "held_out", "train_views")
-BUDGET += ("device", "threads", "clock", "tested")
+BUDGET = "preset", "minutes", "iterations", "held_out", "train_views", "device", "threads", "clock", "tested"
 ROW = ("ablation", "method", *BUDGET)
 UNPRINTED = ("particles", "backward")  # methods of this project that the paper prints no row of
 METHODS = ("particles", "forward", "backward")  # that are compared in pictures
@@ -133,11 +132,6 @@ def _table(key: str, entry: dict, datasets: dict) -> PaperTable:
     return PaperTable(*of_table, entry["notes"], means)
 
 
-def dataset_of(run: Row) -> str:
-    """Return the dataset of a run's scene, also of a counterpart's."""
-    return run["dataset"].removeprefix(COUNTERPART)
-
-
 def measured(table: PaperTable, runs: Runs, variants: Sequence[str] = ()) -> list[Runs]:
     """Return the runs of each measured row: by variant, then as printed, then ``UNPRINTED``, then others.
 
@@ -154,7 +148,7 @@ def measured(table: PaperTable, runs: Runs, variants: Sequence[str] = ()) -> lis
         by_method = methods.index(run["method"]) if run["method"] in methods else len(methods)
         return variants.index(run["ablation"] or "plain"), by_method, *(str(run[name] or "") for name in ROW)
 
-    fitting = (r for r in runs if (r["ablation"] or "plain") in variants and dataset_of(r) in datasets)
+    fitting = (run for run in runs.where(origin=datasets) if (run["ablation"] or "plain") in variants)
     return sorted(Runs(fitting).by(*ROW).values(), key=place)
 
 
@@ -164,9 +158,9 @@ def by_seed(runs: Runs, group: Group, metric: str) -> dict[int, float]:
     Empty if there is no such seed, or the scenes' images differ in size or background.
     """
     scores, conditions = {}, set()
-    for run in runs:
+    for run in runs.where(origin=group.dataset, scene=group.scenes):
         of_run = run["test"].get(group.ability or run["ability"], {})
-        if dataset_of(run) == group.dataset and run["scene"] in group.scenes and metric in of_run:
+        if metric in of_run:
             scores[run["scene"], run["seed"]] = of_run[metric] * (100 if metric in DEPTH else 1)
             protocol = run["metrics"].get("protocol", {})
             conditions.add(tuple(protocol.get(key) for key in ("half_resolution", "scale", "background")))
@@ -177,7 +171,7 @@ def by_seed(runs: Runs, group: Group, metric: str) -> dict[int, float]:
 
 def cells_of(runs: Runs, table: PaperTable) -> list[Estimate | None]:
     """Estimate every column's mean over the seeds of ``by_seed``; None where these are none."""
-    return [Estimate.of(list(by_seed(runs, *column).values())) for column in table.columns]
+    return [Estimate.of(by_seed(runs, *column).values()) for column in table.columns]
 
 
 def numbered(runs: Iterable[Row]) -> dict[str, int]:
@@ -205,7 +199,7 @@ def comparison(table: PaperTable, runs: Runs, numbers: Mapping[str, int] | None 
         numbers: of the page's protocols, as of ``numbered``; None: those of ``runs`` alone.
     """
     found = measured(table, runs)
-    table = of_datasets(table, {dataset_of(run) for of_row in found for run in of_row})
+    table = of_datasets(table, {run["origin"] for of_row in found for run in of_row})
     numbers, no_costs = numbers or numbered(runs), [None] * len(COSTS)
     lines, rules = [], []
     for printed in [*table.rows, None]:
@@ -233,15 +227,12 @@ def stand_in(table: PaperTable, runs: Runs, numbers: Mapping[str, int] | None = 
     made, found = counterpart(table, runs), measured(table, runs)
     if made is None or not found:
         return None
-    numbers, datasets = numbers or numbered(runs), {dataset_of(run) for of_row in found for run in of_row}
-    shown = [
-        (number, group)
-        for number, (group, metric) in enumerate(table.columns)
-        if metric == "psnr" and group.dataset in datasets and len(group.scenes) > 1
-    ]
+    numbers, datasets = numbers or numbered(runs), {run["origin"] for of_row in found for run in of_row}
+    scores = [(i, group) for i, (group, metric) in enumerate(table.columns) if metric == "psnr"]
+    shown = [(i, group) for i, group in scores if group.dataset in datasets and len(group.scenes) > 1]
     lines = []
     for of_row in found:
-        printed, own = table.printed(of_row[0]), {dataset_of(run) for run in of_row}
+        printed, own = table.printed(of_row[0]), {run["origin"] for run in of_row}
         values = [printed.values[i] if printed and group.dataset in own else "" for i, group in shown]
         beside = [printed.name if printed else "", *values]
         lines.append([name_of(of_row, found), *cells_of(of_row, made), *costs_of(of_row, numbers), *beside])
@@ -264,7 +255,7 @@ def counterpart(table: PaperTable, runs: Runs) -> PaperTable | None:
     """
     groups = {}
     for group in table.groups if not table.means else ():
-        for scene in sorted({run["scene"] for run in runs if dataset_of(run) == group.dataset}):
+        for scene in runs.where(origin=group.dataset).by("scene"):
             name = group.name if group.ability else scene
             groups[scene, group.ability, group.metrics] = group._replace(name=name, scenes=(scene,))
     return replace(table, groups=list(groups.values()), rows=[], means={}) if groups else None
@@ -305,9 +296,8 @@ def name_of(runs: Runs, among: Sequence[Runs]) -> str:
 
 def _conditions(runs: Runs) -> list[str]:
     run, seeds = runs[0], len(runs.by("seed"))
-    parts = [run["preset"]]
-    if run["minutes"]:
-        parts.append(f"{run['minutes']:g} min" + " of processor time" * (run["clock"] == "processor"))
+    clock = " of processor time" * (run["clock"] == "processor")
+    parts = [run["preset"], *([f"{run['minutes']:g} min{clock}"] if run["minutes"] else [])]
     parts += [f"{run['iterations']} steps"] if run["iterations"] else []
     parts += [f"{seeds} seeds"] if seeds > 1 else []
     parts += [f"{run['held_out']} views held out"] if run["held_out"] else []
@@ -354,17 +344,14 @@ def write_paper(folder: Path, out: Path, published: Path = PAPER, curves: Path |
     elsewhere = [
         f"{dataset or 'no dataset'}, {len(found)} run{'s' * (len(found) > 1)}: "
         "not in any table of the paper; use kind=compare or kind=accuracy_time"
-        for dataset, found in Runs(run | {"of": dataset_of(run)} for run in runs).by("of").items()
+        for dataset, found in runs.by("origin").items()
         if dataset not in {group.dataset for table in paper for group in table.groups}
     ]
     for line in elsewhere:
         print(line)
     left_out += elsewhere
     real, made = runs.where(counterpart=False), runs.where(counterpart=True)
-    shown_runs = {
-        table: [Runs(run for row in measured(table, kind) for run in row) for kind in (real, made)]
-        for table in paper
-    }
+    shown_runs = {table: [Runs(chain(*measured(table, kind))) for kind in (real, made)] for table in paper}
     used = Runs(run for kinds in shown_runs.values() for kind in kinds for run in kind)
     numbers, tables, files = numbered(used), [], []
     for table, (of_real, of_made) in shown_runs.items():
@@ -399,7 +386,7 @@ def _read(folder: Path, tables: Iterable[PaperTable]) -> tuple[Runs, list[str]]:
     runs, left_out = read_runs(folder)
     open_kind = {group.dataset for table in tables for group in table.groups if group.ability is None}
     for run in runs:
-        if dataset_of(run) in open_kind and run["ability"] != "all":
+        if run["origin"] in open_kind and run["ability"] != "all":
             run["protocol"] += f", scores of test views {KINDS.get(run['ability'], run['ability'])}"
     runs, older = runs.newest("dataset", "scene", "seed", *ROW)
     return runs, left_out + [f"{row['folder']}: another run of the same is newer" for row in older]
@@ -454,13 +441,13 @@ def _figures(runs: Runs, out: Path, curves: Path | None) -> list[Section]:
                 rivals = own if len(own) > 1 else rivals
             if rivals:
                 first = next(iter(rivals.values()))
-                usual = 0.5 if dataset_of(first) == "hypernerf" else 0.0
+                usual = 0.5 if first["origin"] == "hypernerf" else 0.0
                 at = first["metrics"]["protocol"].get("canonical_time", usual)
                 words = f"{scene}, near the canonical time"
                 drawn = figures.draw_beside(out / f"paper-canonical-{scene}.png", rivals, at, words)
                 add(f"Canonical comparison: {scene}", drawn)
         for dataset, method in product(DATASETS, METHODS[:2]):
-            scenes = {run["scene"]: run for run in plain.where(method=method) if dataset_of(run) == dataset}
+            scenes = {run["scene"]: run for run in plain.where(method=method, origin=dataset)}
             drawn = figures.draw_sheet(out / f"paper-views-{dataset}-{method}.png", scenes)
             add(f"Views: {dataset}, {method}", drawn)
     except ImportError as error:
@@ -493,7 +480,7 @@ def write_ablation(folder: Path, out: Path, published: Path = PAPER) -> list[Pat
     tables = [table for table in paper if not table.means and len(table.parts) > 1]
     known = {row.variant for table in tables for row in table.parts}
     rest = Runs(r for r in runs.where(preset=AT_REST) if r["ablation"] in known or r["method"] == "backward")
-    runs = Runs(run for run in runs if run["ablation"] in known and run["preset"] != AT_REST)
+    runs = Runs(run for run in runs.where(ablation=known) if run["preset"] != AT_REST)
     if not runs and not rest:
         raise ValueError(f"{folder}: expected runs of ablations, but got none; make some with make ablations")
     page, files = out / "ablation.md", [out / "ablation.md"]
@@ -521,7 +508,7 @@ def _page(tables: Sequence[PaperTable], runs: Runs, left_out: Sequence[str]) -> 
     ]
     columns = ["budget of a run", *(Column(kind, 0) for kind in ("rows", *ORDERS))]
     caption = "Rows of all tables below, by what became of the paper's order:"
-    used = Runs(run for run in runs if any(run["ablation"] in table.variants for table in tables))
+    used = runs.where(ablation={variant for table in tables for variant in table.variants})
     about = _about(sections, used, numbers)
     sections = [Section("In short", [Table(columns, lines, caption)]), *sections, about] if runs else []
     sections += [Section("Left out", facts=left_out)] if left_out else []
@@ -548,10 +535,10 @@ def _at_rest(tables: Sequence[PaperTable], runs: Runs) -> dict:
                 if scores:
                     change = Estimate.of(change) if variant != "full" else None
                     order = verdict(change.mean, printed.get(variant), noise) if change else None
-                    late = Estimate.of([g for run in of_row if (g := late_gain(run["points"])) is not None])
-                    line = [scene, name, printed.get(variant), Estimate.of(list(scores.values())), change]
+                    late = Estimate.of(late_gain(run["points"]) for run in of_row)
+                    line = [scene, name, printed.get(variant), Estimate.of(scores.values()), change, order]
                     took = of_row.mean("train")
-                    line += [order, of_row.estimate("psnr_canonical"), late]
+                    line += [of_row.estimate("psnr_canonical"), late]
                     lines.append([*line, of_row.mean("steps"), took and took / 60])
     return {"table": Table(columns, lines), "noise": "; ".join(noises), "facts": facts(runs, numbered(runs))}
 
@@ -572,8 +559,7 @@ def _groups(table: PaperTable, runs: Runs) -> Iterator[tuple[Group, Runs, bool]]
         of_kind = runs.where(counterpart=made)
         shown = counterpart(table, of_kind) if made else table
         for group in shown.groups if shown else ():
-            own = Runs(run for run in of_kind if run["scene"] in group.scenes)
-            own = Runs(run for run in own if dataset_of(run) == group.dataset)
+            own = of_kind.where(scene=group.scenes, origin=group.dataset)
             if scenes := tuple(scene for scene in group.scenes if own.where(scene=scene)):
                 yield group._replace(scenes=scenes), own, made
 
@@ -590,7 +576,7 @@ def _ablated(
             title = f"{table.title}: {group.name}"
             title += f", of which {', '.join(group.scenes)}" if not made and group.scenes != whole else ""
             title += f", {group.scenes[0]}" if made and group.name != group.scenes[0] else ""
-            used = Runs(run for run in own if run["ablation"] in table.variants)
+            used = own.where(ablation=set(table.variants))
             sections.append(Section(title, [changes], facts(used, numbers), table.notes))
     return sections
 
@@ -640,7 +626,7 @@ def _changes(table: PaperTable, group: Group, runs: Runs, orders: dict[str, list
                 orders.setdefault(label, []).append(order)
             step, of_whole = found[row.variant].mean("step"), found["full"].mean("step")
             times = step / of_whole if step and of_whole else None
-            line += [Estimate.of(list(psnr[row.variant].values())), change, order, step, times]
+            line += [Estimate.of(psnr[row.variant].values()), change, order, step, times]
     kept = [line for line in lines if any(cell is not None for cell in line[2:])]
     return Table(columns, kept, "; ".join(captions) + ".")
 

@@ -41,18 +41,8 @@ CONDITIONS = {
 }
 KEY = ("method", "preset", "scene", "minutes", "seed", *CONDITIONS)
 SCORES = ("psnr", "ssim", "lpips")  # that a table has, whether measured or not
-NUMBERS = (
-    "steps",
-    "step",
-    "frame",
-    "parameters",
-    "memory",
-    "ends",
-    "motion_error",
-    "psnr_space",
-    "psnr_time",
-)
-NUMBERS += ("psnr_canonical", "size", "wall", "processor")
+NUMBERS = ("steps", "step", "frame", "parameters", "memory", "ends", "motion_error")
+NUMBERS += ("psnr_space", "psnr_time", "psnr_canonical", "size", "wall", "processor")
 TEXTS = ("dataset", "day", "commit", "departures", "faults", "views", "curve", "command")
 # Kinds of test view, and parts of their pixels, that scores are of.
 KINDS = {"space": "at training times", "time": "between training times", "canonical": "at the canonical time"}
@@ -64,34 +54,16 @@ KINDS |= {
 }
 COUNTERPART = "counterpart of "  # begins the dataset of synthetic scenes that stand in for its own
 NETS = ("vgg", "alex", "squeeze")  # LPIPS in tables is of the first whose weights were there
-PROTOCOL = (
-    "half_resolution",
-    "scale",
-    "split",
-    "frames",
-    "views",
-    "train_frames",
-    "train_views",
-    "test_views",
-    "test_cameras",
-    "test_moments",
-    "test_frames",
-)
-PROTOCOL += (
-    "window",
-    "measured",
-    "held_out",
-    "canonical_time",
-    "mask_box",
-    "exposure",
-)  # what pages tell of a run's protocol
+# What pages tell of a run's protocol.
+PROTOCOL = ("half_resolution", "scale", "split", "frames", "views", "train_frames", "train_views")
+PROTOCOL += ("test_views", "test_cameras", "test_moments", "test_frames", "window", "measured", "held_out")
+PROTOCOL += ("canonical_time", "mask_box", "exposure")
 OWN = "run|sheets|paths.runs|paths.data"  # keys that say where a run's files are, not what it is
 # What stands for the folders of whoever types a command again.
 PLACES = {"paths.scenes": "DATASETS", "data.root": "SCENES", "lpips_weights": "WEIGHTS"}
 UNREADABLE = OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError, yaml.YAMLError
 _ENDS = 0.1  # share of the time that counts as its first and last part
 _EARLY, _LATE = 0.95, 1.5  # of its minutes: less was ended by steps, more had a last step that took long
-_MOST = 1 << 24  # bytes of a table that is read back
 
 
 class Point(NamedTuple):
@@ -110,8 +82,9 @@ class Runs(list[Row]):
     """Rows, to select, group and average."""
 
     def where(self, **equal: object) -> Runs:
-        """Select the rows that have these values."""
-        return Runs(row for row in self if all(row[name] == value for name, value in equal.items()))
+        """Select the rows that have these values; of a set or a tuple, one of its values."""
+        wanted = {n: value if isinstance(value, set | tuple) else (value,) for n, value in equal.items()}
+        return Runs(row for row in self if all(row[name] in values for name, values in wanted.items()))
 
     def by(self, *names: str) -> dict:
         """Group rows that are equal in ``names``, in the order of these: the value, or the values -> Runs."""
@@ -129,7 +102,7 @@ class Runs(list[Row]):
 
     def estimate(self, name: str) -> Estimate | None:
         """Estimate a number over the rows that have it; None if none has."""
-        return Estimate.of([row[name] for row in self if row.get(name) is not None])
+        return Estimate.of(row.get(name) for row in self)
 
     def mean(self, name: str) -> float | None:
         """Average a number over the rows that have it; None if none has."""
@@ -144,6 +117,11 @@ class Runs(list[Row]):
         """
         estimates = {name: self.estimate(name) for name in (*self.scores(), *NUMBERS, "epe")}
         return self[0] | {"seeds": len(self)} | estimates | more
+
+    def paired(self, others: Runs) -> list[tuple[Row, Row]]:
+        """Pair the rows with those of ``others`` of the same seed."""
+        of_seed = {row["seed"]: row for row in others}
+        return [(row, of_seed[row["seed"]]) for row in self if row["seed"] in of_seed]
 
     def scores(self) -> list[str]:
         """List the metrics of the rows in the order of tables: ``SCORES``, then those that were added."""
@@ -275,7 +253,8 @@ def read_run(folder: Path) -> Row:
     * ``variant``: that name, else method and preset; ``about`` it; ``against``: the variant to compare with;
     * ``ability``: the kind of test view that scores are of: ``all``, else ``time`` (between training times),
       else the first; ``test``: the scores of every kind; ``tested``: number of views scored, None: all;
-    * ``train`` (seconds), ``epe`` (world units), ``torch``, ``counterpart``, ``effects``, ``protocol``.
+    * ``train`` (seconds), ``epe`` (world units), ``torch``, ``effects``, ``protocol``;
+    * ``counterpart``: whether the scene is synthetic; ``origin``: its dataset without ``COUNTERPART``.
     """
     config = yaml.safe_load(read_text(folder / "config.yaml", MOST_CONFIG))
     stages = {file.parent.name: load_json(file) for file in sorted(folder.glob("*/done.json"))}
@@ -313,6 +292,7 @@ def read_run(folder: Path) -> Row:
     row |= {"train_views": protocol.get("train_views")}
     row |= {"tested": int(tested) if tested.isdigit() else None}  # as of "10 of 30 test views, evenly spread"
     row |= {"counterpart": synthetic, "dataset": COUNTERPART * stands_in + dataset}
+    row["origin"] = dataset.removeprefix(COUNTERPART)
     row |= {"day": datetime.fromtimestamp(measured_at / 1e9, timezone.utc).date().isoformat()}
     row |= {"effects": ", ".join(name for name, on in (metrics.get("effects") or {}).items() if on)}
     row |= {"curve": " ".join(f"{point.seconds:.1f}:{point.psnr:.2f}" for point in points)}
@@ -405,9 +385,7 @@ def add_to_table(file: Path, rows: Iterable[Row]) -> Runs:
     Raises:
         ValueError: if there would be no row.
     """
-    known = (
-        [_read(row) for row in csv.DictReader(io.StringIO(read_text(file, _MOST)))] if file.is_file() else []
-    )
+    known = [_read(row) for row in read_rows(file)]
     rows = [row | {"command": portable(row["command"])} for row in rows]
     known += sorted(rows, key=lambda row: row["measured_at"])
     if not known:

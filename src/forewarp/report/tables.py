@@ -166,9 +166,10 @@ class Table:
         return file.getvalue()
 
 
-def score_columns(names: Iterable[str]) -> dict[str, Column]:
-    """Make a column for each metric."""
-    return {name: Column(metric_of(name).title, metric_of(name).digits) for name in names}
+def score_columns(names: Iterable[str], *, with_unit: bool = False) -> dict[str, Column]:
+    """Make a column for each metric, named by its title, or by its heading, which has the unit."""
+    metrics = {name: metric_of(name) for name in names}
+    return {n: Column(m.heading if with_unit else m.title, m.digits) for n, m in metrics.items()}
 
 
 _TAG = re.compile(r"<(?!/?u>)(?=[A-Za-z/!?])")  # a run's names and notes may hold any; ours underline
