@@ -229,7 +229,7 @@ F2 = {"features": 0, "frequencies": 5, "width": 64, "layers": 4, "bases": 15, "n
 VIEW = {"features": 12, "frequencies": 4, "width": 64, "layers": 2}
 FORWARD = {
     "3.4 coarse: the feature is the colour, no inpainting": {
-        "stage.coarse.effects": ["motion", "background"],
+        "stage.coarse.effects": ["motion", "background"]
     },
     "A.2 F1": under("model.radiance", grid_features=12, frequencies=5, width=128, layers=3),
     "A.2 F2": under("model.trajectory", **F2),

@@ -20,19 +20,7 @@ from forewarp.files import MOST_CONFIG, read_rows, read_text, replace_file
 from forewarp.metrics.gain import Estimate
 from forewarp.metrics.registry import metric_of
 from forewarp.report import figures
-from forewarp.report.results import (
-    CONDITIONS,
-    KEY,
-    NETS,
-    Row,
-    Runs,
-    add_to_table,
-    in_words,
-    key_of,
-    length,
-    pairs,
-    read_runs,
-)
+from forewarp.report.results import CONDITIONS, Runs, add_to_table, in_words, key_of, length, pairs, read_runs
 from forewarp.report.tables import Column, Table, rendered, score_columns
 
 OTHERS = Path(__file__).with_name("published.yaml")  # results of others
@@ -85,10 +73,8 @@ def write_minutes(folder: Path, out: Path, published: Sequence[Published] = ()) 
     for file in out.glob("*.csv"):  # of earlier calls
         named = {row.get("method") for row in read_rows(file)}
         methods |= named if named == {file.stem} and file.with_suffix(".md").is_file() else set()
-    tables = {
-        method: labelled(add_to_table(out / f"{method}.csv", runs.where(method=method)))
-        for method in sorted(methods)
-    }
+    rows = {name: add_to_table(out / f"{name}.csv", runs.where(method=name)) for name in sorted(methods)}
+    tables = {method: labelled(own) for method, own in rows.items()}
     for method, own in tables.items():
         others = {other: found for other, found in tables.items() if other != method}
         page, picture = out / f"{method}.md", out / f"{method}.png"
@@ -110,7 +96,7 @@ def _timed(folder: Path) -> tuple[Runs, list[str]]:
     """Read the measured runs of so many minutes, the newest of equal ones; and a line for each other run."""
     runs, left_out = read_runs(folder)
     endless = [(row, "no budget.minutes") for row in runs.where(minutes=None)]
-    runs, older = Runs(row for row in runs if row["minutes"] is not None).newest(*KEY)
+    runs, older = Runs(row for row in runs if row["minutes"] is not None).newest("method", "seed", *TASK)
     unused = [*endless, *((row, "another run of the same is newer") for row in older)]
     return runs, left_out + [f"{row['folder'].relative_to(folder)}: {why}" for row, why in unused]
 
@@ -144,7 +130,7 @@ def size_of(group: Runs) -> float:
     return group.mean("size") or group[0]["density"] or 0.0
 
 
-def row_of(group: Runs, **more: object) -> Row:
+def row_of(group: Runs, **more: object) -> dict:
     """Make the row of tables for runs that differ in the seed; ``took``: the minutes that they took."""
     took = length(group[0]["minutes"]).removesuffix(" min") + group.taken()[1]
     step, error = group.mean("step"), group.estimate("motion_error")
@@ -176,8 +162,10 @@ def _of_method(method: str, runs: Runs, others: Mapping[str, Runs]) -> dict:
     larger = _larger(runs.where(density=None))
     pictures = with_seeds | {"pictures": "images"} | scores
     costs = BEGIN | {name: replace(column, spread=False) for name, column in COSTS.items()}
-    about = {"method": method, "nets": NETS, "noise": NOISE, "machine": made_on(runs)}
-    return about | {
+    return {
+        "method": method,
+        "noise": NOISE,
+        "machine": made_on(runs),
         "versions": len({row["commit"] or row["day"] for row in runs}),
         "by_minutes": _by_minutes(plain(runs)),
         "each": Table.of(map(row_of, groups), each),
@@ -210,7 +198,7 @@ def _by_minutes(runs: Runs) -> Table:
     return Table(["scene", *map(length, minutes)], lines, "PSNR (dB) of test views." + about)
 
 
-def _against_fewer(runs: Runs, varied: str, order: Callable[[Runs], float]) -> list[Row]:
+def _against_fewer(runs: Runs, varied: str, order: Callable[[Runs], float]) -> list[dict]:
     """List groups that differ in one thing alone, each with how its PSNR is to that of the group before."""
     series: dict[tuple, list[Runs]] = {}
     for group in alike(runs):
@@ -233,7 +221,7 @@ def held(before: float, now: float) -> str:
     return f"holds ({change:+.2f} dB)" if change >= -NOISE - 1e-9 else f"falls by {-change:.2f} dB"
 
 
-def _larger(runs: Runs) -> list[Row]:
+def _larger(runs: Runs) -> list[dict]:
     """List runs on larger pictures, reduced to be scored, each before those that learned from small ones."""
     groups, lines = alike(runs), []
     for group in groups:
@@ -355,7 +343,7 @@ def write_methods(folder: Path, out: Path) -> list[Path]:
         tables = [_reached(group, own) for group in own.by("minutes", *CONDITIONS).values()]
         scenes.append({"name": scene, "pictures": pictures, "tables": tables})
         written += drawn
-    about = {"machine": made_on(runs), "nets": NETS, "command": runs.command()}
+    about = {"machine": made_on(runs), "command": runs.command()}
     about |= {"presets": list(runs.by("preset")), "departures": _departures(runs), "left_out": left_out}
     with_steps = (out / "faithful-step.md").is_file()  # by python -m tests.bench.faithful
     replace_file(page, rendered("methods.md.j2", scenes=scenes, with_steps=with_steps, **about))

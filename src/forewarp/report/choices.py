@@ -18,19 +18,7 @@ from forewarp.files import read_json, replace_file
 from forewarp.metrics.gain import FACTORS, Estimate, measure_effect
 from forewarp.metrics.registry import METRICS, metric_of
 from forewarp.report.figures import draw_scene
-from forewarp.report.results import (
-    KINDS,
-    PLACES,
-    UNREADABLE,
-    Point,
-    Row,
-    Runs,
-    overrides,
-    portable,
-    read_run,
-    read_runs,
-    unreadable,
-)
+from forewarp.report.results import KINDS, PLACES, Point, Row, Runs, overrides, portable, read_runs
 from forewarp.report.tables import Column, Difference, Table, rendered, score_columns
 
 COSTS = {"epe": Column("EPE", 4), "step": Column("s/step", 3), "frame": Column("s/frame")}
@@ -43,16 +31,17 @@ def seconds_to(points: Sequence[Point], psnr: float) -> float | None:
     """Return the seconds until two evaluations in a row first reach a PSNR (dB); None if none do.
 
     >>> curve = [Point(s, p, 0) for s, p in [(1, 20), (2, 25), (4, 24), (8, 26), (16, 27)]]
-    >>> seconds_to(curve, 25), seconds_to(curve, 27)
-    (8, None)
+    >>> seconds_to(curve, 25), seconds_to(curve, 27), seconds_to([], 25)
+    (8, None, None)
     """
     steps = zip(points, points[1:])
     return next((a.seconds for a, b in steps if a.psnr >= psnr and b.psnr >= psnr), None)
 
 
-def by_variant(runs: Runs) -> dict[str, Runs]:
-    """Group runs that differ only in the seed; the base first."""
-    return dict(sorted(runs.by("variant").items(), key=lambda item: item[0] != "base"))
+def by_variant(runs: Runs, *names: str) -> dict:
+    """Group runs by variant, and by ``names`` too, as ``Runs.by`` does; the base first."""
+    groups = runs.by("variant", *names)
+    return dict(sorted(groups.items(), key=lambda item: item[1][0]["variant"] != "base"))
 
 
 def _read(folder: Path, needed: Sequence[str] = ("metrics.json",)) -> tuple[Runs, list[str]]:
@@ -80,9 +69,7 @@ def write_accuracy_time(
     runs, left_out = _read(folder, ["accuracy_time.csv", "metrics.json"])
     scenes, written = [], []
     for scene, found in runs.by("scene").items():
-        groups = {}
-        for variant, group in by_variant(found).items():
-            groups |= {(variant, minutes): same for minutes, same in group.by("minutes").items()}
+        groups = by_variant(found, "minutes")
         name = "accuracy-time-" + re.sub(r"[^\w.-]+", "-", scene).strip("-")
         picture, file = out / f"{name}.png", out / f"{name}.csv"
         beside = [other for other in published if other.dataset == found[0]["dataset"]]
@@ -207,8 +194,13 @@ def write_effects(folder: Path, out: Path) -> list[Path]:
         planned = chain(*newest.where(ablation="auto").by("scene", "seed").values())
         first = {row["scene"]: row["plan"].get("effects", {}) for row in reversed([*planned])}
         about = {"model": model, "machine": own.machines(), "left_out": left_out}
-        tables = {"table": choices(newest), "reasons": reasons(first)}
-        replace_file(page, rendered("effects.md.j2", **about, **tables))
+        why = [
+            [scene, name.replace("_", " "), decision["choice"], decision["because"]]
+            for scene in sorted(first)
+            for name, decision in first[scene].items()
+        ]
+        reasons = Table(["scene", "effect", "choice", "because"], why)
+        replace_file(page, rendered("effects.md.j2", **about, table=choices(newest), reasons=reasons))
         lines = [
             row | {"planning": row["plan"].get("seconds"), "command": portable(row["command"])}
             for row in chain(*own.by("scene", "ablation", "seed").values())
@@ -216,16 +208,6 @@ def write_effects(folder: Path, out: Path) -> list[Path]:
         replace_file(page.with_suffix(".csv"), Table.of(lines, columns).csv())
         files += [page, page.with_suffix(".csv")]
     return files
-
-
-def reasons(effects: Mapping[str, Mapping]) -> Table:
-    """List for every scene what was planned of each effect, and why."""
-    lines = [
-        [scene, name.replace("_", " "), decision["choice"], decision["because"]]
-        for scene in sorted(effects)
-        for name, decision in effects[scene].items()
-    ]
-    return Table(["scene", "effect", "choice", "because"], lines)
 
 
 def choices(runs: Runs) -> Table:
@@ -345,7 +327,7 @@ def compare(runs: dict[str, Row]) -> Table:
     says why there are no differences, or no metrics.
 
     Args:
-        runs: as of ``read_compared``.
+        runs: as of ``results.read_compared``.
     """
     rows, lines, two = list(runs.values()), [], len(runs) == 2
     same_scene = len({(row["dataset"], row["scene"]) for row in rows}) == 1
@@ -377,30 +359,3 @@ def compare(runs: dict[str, Row]) -> Table:
         kinds = (f"{name}: {', '.join(row['test']) or 'none'}" for name, row in runs.items())
         told.append(f"no metrics: no kind of test view was measured in all runs ({'; '.join(kinds)})")
     return Table(["PSNR (dB) of test views", *runs, *["difference"] * two], lines, "\n".join(told))
-
-
-def read_compared(folders: Sequence[str | Path]) -> dict[str, Row]:
-    """Read runs, named by their methods if these differ, else by as much of their folders as needed.
-
-    Raises:
-        ValueError: if there is no folder, or one that holds no measured run.
-    """
-    if not folders:
-        raise ValueError("runs: expected folders of runs, but got none; set runs=[FOLDER,FOLDER]")
-    rows, paths = [], [Path(folder) for folder in folders]
-    for path in paths:
-        again, numbers = f"forewarp-evaluate run={path}", path / "metrics.json"
-        if not numbers.is_file():
-            raise ValueError(f"{numbers}: expected a run's numbers, but got none; make them with {again}")
-        try:
-            rows.append(read_run(path))
-        except UNREADABLE as error:
-            got = f"{unreadable(error)}; measure it with {again}"
-            raise ValueError(f"{path}: expected a measured run, but got {got}") from error
-    choices = (
-        [row["metrics"].get("protocol", {}).get("method", path.name) for row, path in zip(rows, paths)],
-        [path.resolve().name for path in paths],
-        [path.as_posix() for path in paths],
-        [f"{number} {path.as_posix()}" for number, path in enumerate(paths, 1)],
-    )
-    return dict(zip(next(names for names in choices if len(set(names)) == len(names)), rows))

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain, product
 from pathlib import Path
@@ -199,7 +199,11 @@ def comparison(table: PaperTable, runs: Runs, numbers: Mapping[str, int] | None 
         numbers: of the page's protocols, as of ``numbered``; None: those of ``runs`` alone.
     """
     found = measured(table, runs)
-    table = of_datasets(table, {run["origin"] for of_row in found for run in of_row})
+    datasets = {run["origin"] for of_row in found for run in of_row}
+    kept = [i for i, (group, _) in enumerate(table.columns) if group.dataset in datasets]
+    rows = [row._replace(values=tuple(row.values[i] for i in kept)) for row in table.rows]
+    groups = [group for group in table.groups if group.dataset in datasets]
+    table = replace(table, groups=groups, rows=rows)
     numbers, no_costs = numbers or numbered(runs), [None] * len(COSTS)
     lines, rules = [], []
     for printed in [*table.rows, None]:
@@ -239,13 +243,6 @@ def stand_in(table: PaperTable, runs: Runs, numbers: Mapping[str, int] | None = 
     columns = ["measured", *(_column(*column) for column in made.columns), *COSTS, "published as"]
     columns += [f"published: {group.name} PSNR" for _, group in shown]
     return Table(columns, lines, marks=_marks(found, made, lines, 1)).filled()
-
-
-def of_datasets(table: PaperTable, datasets: Collection[str]) -> PaperTable:
-    """Leave out the columns of other datasets."""
-    kept = [i for i, (group, _) in enumerate(table.columns) if group.dataset in datasets]
-    rows = [row._replace(values=tuple(row.values[i] for i in kept)) for row in table.rows]
-    return replace(table, groups=[group for group in table.groups if group.dataset in datasets], rows=rows)
 
 
 def counterpart(table: PaperTable, runs: Runs) -> PaperTable | None:

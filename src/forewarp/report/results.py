@@ -12,7 +12,8 @@ import io
 import math
 import re
 import statistics
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from datetime import datetime, timezone
 from itertools import chain
 from pathlib import Path
@@ -210,8 +211,8 @@ def read_runs(root: Path, needed: Sequence[str] = ("metrics.json",)) -> tuple[Ru
         absent = [name for name in needed if not (folder / name).is_file()]
         try:
             row = read_run(folder)
-        except UNREADABLE as error:
-            left_out.append(f"{folder.relative_to(root)}: cannot be read ({unreadable(error)})")
+        except ValueError as error:
+            left_out.append(f"{folder.relative_to(root)}: cannot be read ({error})")
             continue
         if row["config"].get("debug"):
             debugging += 1
@@ -237,11 +238,17 @@ def read_runs(root: Path, needed: Sequence[str] = ("metrics.json",)) -> tuple[Ru
     return runs, left_out
 
 
-def unreadable(error: Exception) -> str:
-    """Say in a few words why a run cannot be read."""
-    return f"no key {error}" if isinstance(error, KeyError) else str(error).split("\n")[0]
+@contextmanager
+def refused(before: str = "", after: str = "") -> Iterator[None]:
+    """Say in one line, as a ValueError, what is wrong with a run's files; with words around it."""
+    try:
+        yield
+    except UNREADABLE as error:
+        why = f"no key {error}" if isinstance(error, KeyError) else str(error).split("\n")[0]
+        raise ValueError(f"{before}{why}{after}") from error
 
 
+@refused()
 def read_run(folder: Path) -> Row:
     """Read a run's folder; files that are missing are empty.
 
@@ -326,6 +333,30 @@ def read_run(folder: Path) -> Row:
     shown = {n: score for n, score in scores.items() if metric_of(n).summary and not n.startswith("lpips_")}
     scores = dict.fromkeys(SCORES) | shown | {"lpips": nets[0] if nets else None}
     return row | scores | {"scores": scores}
+
+
+def read_compared(folders: Sequence[str | Path]) -> dict[str, Row]:
+    """Read runs, named by their methods if these differ, else by as much of their folders as needed.
+
+    Raises:
+        ValueError: if there is no folder, or one that holds no measured run.
+    """
+    if not folders:
+        raise ValueError("runs: expected folders of runs, but got none; set runs=[FOLDER,FOLDER]")
+    rows, paths = [], [Path(folder) for folder in folders]
+    for path in paths:
+        again, numbers = f"forewarp-evaluate run={path}", path / "metrics.json"
+        if not numbers.is_file():
+            raise ValueError(f"{numbers}: expected a run's numbers, but got none; make them with {again}")
+        with refused(f"{path}: expected a measured run, but got ", f"; measure it with {again}"):
+            rows.append(read_run(path))
+    choices = (
+        [row["metrics"].get("protocol", {}).get("method", path.name) for row, path in zip(rows, paths)],
+        [path.resolve().name for path in paths],
+        [path.as_posix() for path in paths],
+        [f"{number} {path.as_posix()}" for number, path in enumerate(paths, 1)],
+    )
+    return dict(zip(next(names for names in choices if len(set(names)) == len(names)), rows))
 
 
 def read_points(folder: Path) -> tuple[Point, ...]:

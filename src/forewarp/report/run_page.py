@@ -21,7 +21,7 @@ from forewarp.metrics.registry import metric_of
 from forewarp.progress import time_text
 from forewarp.report.choices import seconds_to
 from forewarp.report.figures import sheets_of, thirds
-from forewarp.report.results import KINDS, UNREADABLE, Row, read_run, unreadable
+from forewarp.report.results import KINDS, Row, read_run, refused
 from forewarp.report.tables import TEMPLATES, Column, Table, rendered, score_columns
 
 if TYPE_CHECKING:  # so that what is refused waits for no torch
@@ -99,7 +99,7 @@ def read_story(folder: Path) -> Row:
         some = ", ".join(map(str, runs[:3])) + ", ..." * (len(runs) > 3)
         got = f"{folder}, which holds {len(runs)}; choose one: {some}"
         raise ValueError(f"run: expected the folder of one run, but got {got}")
-    try:
+    with refused(f"run: expected a run whose files can be read, but got {folder} (", ")"):
         row = read_run(folder)
         planned = row["config"].get("stage") or row["stages"]
         stages = [name for name, stage in planned.items() if stage is not None]
@@ -110,9 +110,6 @@ def read_story(folder: Path) -> Row:
         row["loss"] = _read_losses(row, stages)
         sizes = row["metrics"].get("size") or {}
         row["consists"] = next((of for of in sizes.items() if of[0] in ("particles", "voxels")), None)
-    except UNREADABLE as error:
-        got = f"{folder} ({unreadable(error)})"
-        raise ValueError(f"run: expected a run whose files can be read, but got {got}") from error
     return row
 
 
@@ -240,11 +237,8 @@ def room_of(row: Row, media: Media, megabytes: float) -> float:
         ValueError: in one line, if the text alone is larger, or the run's files hold what no page can show.
     """
     views = [dict.fromkeys([*shown.pictures, "thumb"], "") for shown in media.views]
-    try:
+    with refused(f"run: expected a run whose files can be shown, but got {row['folder']} (", ")"):
         bare = len(page(row, media, views, "data:" if media.video else "").encode()) + NOTES
-    except UNREADABLE as error:
-        got = f"{row['folder']} ({unreadable(error)})"
-        raise ValueError(f"run: expected a run whose files can be shown, but got {got}") from error
     room = 1e6 * megabytes - bare
     if room < 0:
         expected = f"room for the page's text, {bare / 1e6:.2f}"

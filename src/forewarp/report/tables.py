@@ -17,6 +17,7 @@ from tabulate import tabulate
 
 from forewarp.metrics.gain import Estimate
 from forewarp.metrics.registry import metric_of
+from forewarp.report.results import NETS
 
 TEMPLATES = Path(__file__).with_name("templates")
 MARKS = {
@@ -202,6 +203,7 @@ def _environment() -> Environment:
         lstrip_blocks=True,
         keep_trailing_newline=True,
     )
+    environment.globals["nets"] = NETS
     environment.filters |= {
         "tex": latex_text,
         "tex_head": _latex_head,
