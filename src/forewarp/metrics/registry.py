@@ -63,11 +63,13 @@ class Metric:
         return f"{self.title} ({self.unit})" if self.unit else self.title
 
 
-def _of_image(name: str):
+def _of_image(name: str, *fields: str):
+    """Score by a function of ``metrics.image``, which gets these fields of the target too."""
+
     def score(prediction: Tensor, target: Target, depth: Tensor | None) -> float | None:
         from forewarp.metrics import image
 
-        return getattr(image, name)(prediction, target.rgb)
+        return getattr(image, name)(prediction, target.rgb, *(getattr(target, field) for field in fields))
 
     return score
 
@@ -103,12 +105,6 @@ def scores_of_parts(prediction: Tensor, target: Target) -> dict[str, dict[str, f
     chosen = zip(PARTS, (valid & target.moving, valid & ~target.moving))
     found = {part: _psnr_of(pixels, prediction, target) for part, pixels in chosen}
     return {part: {"psnr": value} for part, value in found.items() if value is not None}
-
-
-def _covisible_ssim(prediction: Tensor, target: Target, depth: Tensor | None) -> float | None:
-    from forewarp.metrics.image import masked_ssim
-
-    return masked_ssim(prediction, target.rgb, target.covisible)
 
 
 def _psnr_in_box(prediction: Tensor, target: Target, depth: Tensor | None) -> float | None:
@@ -150,7 +146,7 @@ _LISTED = (
     # Distances of different backbones are not comparable; weights are files, so the suite holds the nets.
     *(Metric(f"lpips_{net}", f"LPIPS ({net})", **_LPIPS) for net in NETS),
     Metric("mpsnr", "mPSNR", score=_psnr_where("covisible"), **_DECIBEL, **_COVISIBLE),
-    Metric("mssim", "mSSIM", score=_covisible_ssim, **_SSIM, **_COVISIBLE),
+    Metric("mssim", "mSSIM", score=_of_image("masked_ssim", "covisible"), **_SSIM, **_COVISIBLE),
     *(Metric(f"mlpips_{net}", f"mLPIPS ({net})", **_LPIPS, **_COVISIBLE) for net in NETS),
     *(Metric(f"depth_delta_{t:g}", f"depth < {t:g}", score=_depth_within(t), **_DEPTH) for t in THRESHOLDS),
 )
