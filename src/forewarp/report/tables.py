@@ -145,13 +145,12 @@ class Table:
             form: one of ``MARKS``; "": no marks.
             escape: function applied to the text of each cell first.
         """
-        return [
-            [
-                MARKS[form].get(self.marks.get((i, j)), "{}").format(escape(self.columns[j].text(value)))
-                for j, value in enumerate(row)
-            ]
-            for i, row in enumerate(self.rows)
-        ]
+
+        def marked(i: int, j: int, text: str) -> str:
+            return MARKS[form].get(self.marks.get((i, j)), "{}").format(escape(text))
+
+        texts = [map(Column.text, self.columns, row) for row in self.rows]
+        return [[marked(i, j, text) for j, text in enumerate(row)] for i, row in enumerate(texts)]
 
     def csv(self) -> str:
         """Return all digits as CSV; the standard deviation of an estimate has a column of its own."""
@@ -195,14 +194,9 @@ def rendered(template: str, **values: object) -> str:
 
 @cache
 def _environment() -> Environment:
-    environment = Environment(
-        autoescape=lambda name: name.endswith(".html.j2"),
-        loader=FileSystemLoader(TEMPLATES),
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-        keep_trailing_newline=True,
-    )
+    blocks = dict.fromkeys(("trim_blocks", "lstrip_blocks", "keep_trailing_newline"), True)
+    environment = Environment(loader=FileSystemLoader(TEMPLATES), undefined=StrictUndefined, **blocks)
+    environment.autoescape = lambda name: name.endswith(".html.j2")
     environment.globals["nets"] = NETS
     environment.filters |= {
         "tex": latex_text,
