@@ -200,10 +200,10 @@ def _by_minutes(runs: Runs) -> Table:
 
 def _against_fewer(runs: Runs, varied: str, order: Callable[[Runs], float]) -> list[dict]:
     """List groups that differ in one thing alone, each with how its PSNR is to that of the group before."""
+    shared, lines = [name for name in TASK if name != varied], []
     series: dict[tuple, list[Runs]] = {}
     for group in alike(runs):
-        series.setdefault(key_of(group[0], (name for name in TASK if name != varied)), []).append(group)
-    lines = []
+        series.setdefault(key_of(group[0], shared), []).append(group)
     for groups in (sorted(found, key=order) for found in series.values() if len(found) > 1):
         psnr = [None, *(group.mean("psnr") for group in groups)]
         for group, before, now in zip(groups, psnr, psnr[1:]):
@@ -263,7 +263,7 @@ def above(group: Runs, other: Runs, name: str = "psnr") -> str:
     'worse by 0.1000'
     """
     own, its, metric = group.mean(name), other.mean(name), metric_of(name)
-    if own is None or its is None:
+    if None in (own, its):
         return ""
     if not round(abs(own - its), metric.digits):
         return "equal"
@@ -285,7 +285,7 @@ def _write_lengths(tables: Mapping[str, Runs], out: Path, published: Sequence[Pu
             compared[", ".join([of_task[0]["scene"], *words])] = lengths
     scenes, pictures, used, shown = [], [], Runs(), {}
     for title, lengths in sorted(compared.items()):
-        own = [row for groups in lengths.values() for group in groups for row in group]
+        own = [*chain(*chain(*lengths.values()))]
         beside = [other for other in published if other.dataset == own[0]["dataset"]]
         picture = out / f"accuracy-time-{re.sub(r'[^a-zA-Z0-9]+', '-', title).strip('-')}.png"
         points = {

@@ -130,11 +130,11 @@ def write_price_list(folder: Path, out: Path) -> list[Path]:
         bound = f"{minutes:g} minutes" if minutes else "bounded by steps"
         scenes.append({"title": f"{scene}, {bound}", "tables": [references(found), changes(found)]})
     model = mode([row["method"] for row in runs] or ["forward"])
-    name = "price-list" if model == "forward" else f"price-list-{model}"
+    page = out / ("price-list.md" if model == "forward" else f"price-list-{model}.md")
     text = rendered("price_list.md.j2", machine=runs.machines(), scenes=scenes, left_out=left_out)
-    replace_file(out / f"{name}.md", text)
-    replace_file(out / f"{name}.csv", every_run(runs).csv())
-    return [out / f"{name}.md", out / f"{name}.csv"]
+    replace_file(page, text)
+    replace_file(page.with_suffix(".csv"), every_run(runs).csv())
+    return [page, page.with_suffix(".csv")]
 
 
 def measures_of(runs: Runs) -> dict[str, Column]:
@@ -194,11 +194,8 @@ def write_effects(folder: Path, out: Path) -> list[Path]:
         planned = chain(*newest.where(ablation="auto").by("scene", "seed").values())
         first = {row["scene"]: row["plan"].get("effects", {}) for row in reversed([*planned])}
         about = {"model": model, "machine": own.machines(), "left_out": left_out}
-        why = [
-            [scene, name.replace("_", " "), decision["choice"], decision["because"]]
-            for scene in sorted(first)
-            for name, decision in first[scene].items()
-        ]
+        decisions = [(scene, *decided) for scene in sorted(first) for decided in first[scene].items()]
+        why = [[scene, name.replace("_", " "), d["choice"], d["because"]] for scene, name, d in decisions]
         reasons = Table(["scene", "effect", "choice", "because"], why)
         replace_file(page, rendered("effects.md.j2", **about, table=choices(newest), reasons=reasons))
         lines = [
@@ -261,8 +258,7 @@ def write_search(folder: Path, out: Path) -> list[Path]:
         replace_file(file, table.csv())
         searches.append({"title": title, "table": table, **_again(best_first[0])})
         written.append(file)
-    text = rendered("search.md.j2", searches=searches, left_out=left_out)
-    replace_file(out / "search.md", text)
+    replace_file(out / "search.md", rendered("search.md.j2", searches=searches, left_out=left_out))
     return [out / "search.md", *written]
 
 

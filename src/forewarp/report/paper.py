@@ -22,7 +22,7 @@ from forewarp.metrics.gain import Estimate, pooled_deviation
 from forewarp.metrics.registry import metric_of
 from forewarp.report import figures
 from forewarp.report.choices import every_run
-from forewarp.report.results import KINDS, Point, Row, Runs, portable, read_runs
+from forewarp.report.results import KINDS, Point, Row, Runs, grouped, portable, read_runs
 from forewarp.report.tables import Cell, Column, Difference, Section, Table, rendered
 
 PAPER = Path(__file__).with_name("paper.yaml")  # the printed numbers
@@ -293,14 +293,10 @@ def name_of(runs: Runs, among: Sequence[Runs]) -> str:
 
 def _conditions(runs: Runs) -> list[str]:
     run, seeds = runs[0], len(runs.by("seed"))
-    clock = " of processor time" * (run["clock"] == "processor")
-    parts = [run["preset"], *([f"{run['minutes']:g} min{clock}"] if run["minutes"] else [])]
-    parts += [f"{run['iterations']} steps"] if run["iterations"] else []
-    parts += [f"{seeds} seeds"] if seeds > 1 else []
-    parts += [f"{run['held_out']} views held out"] if run["held_out"] else []
-    parts += [f"{run['train_views']} training views"] if run["train_views"] else []
-    views = run["tested"]
-    return parts + ([f"{views} test view{'s' * (views != 1)}"] if views else [])
+    more = {"seeds": seeds if seeds > 1 else 0, "views held out": run["held_out"]}
+    more |= {"training views": run["train_views"], f"test view{'s' * (run['tested'] != 1)}": run["tested"]}
+    numbers = [f"{number} {words}" for words, number in more.items() if number]
+    return budget_of(run, by_processor=" of processor time") + numbers
 
 
 def _column(group: Group, metric: str) -> Column:
@@ -391,10 +387,7 @@ def _read(folder: Path, tables: Iterable[PaperTable]) -> tuple[Runs, list[str]]:
 
 def _about(tables: Iterable[Section], runs: Runs, numbers: Mapping[str, int]) -> Section:
     """Gather what a page tells once: how the runs were made, and each footnote with its tables."""
-    notes: dict[str, list[str]] = {}
-    for section in tables:
-        for note in section.notes:
-            notes.setdefault(note, []).append(section.title.partition(":")[0])
+    notes = grouped((note, section.title.partition(":")[0]) for section in tables for note in section.notes)
     lines = [f"{', '.join(dict.fromkeys(titles))}: {note}" for note, titles in notes.items()]
     return Section("How they were measured", facts=[*facts(runs, numbers), *lines])
 
@@ -403,12 +396,7 @@ def facts(runs: Runs, numbers: Mapping[str, int]) -> list[str]:
     """State protocols by their numbers on the page, machine, budget, date and a command of the runs."""
     if not runs:
         return ["measured: nothing yet"]
-    budgets = set()
-    for run in runs:
-        minutes = f"{run['minutes']:g} min a run" if run["minutes"] else ""
-        minutes += " by the processor clock" if minutes and run["clock"] == "processor" else ""
-        steps = f"{run['iterations']} steps" if run["iterations"] else ""
-        budgets.add(", ".join(filter(None, (run["preset"], minutes, steps))))
+    budgets = {", ".join(budget_of(run, " a run", " by the processor clock")) for run in runs}
     protocols = sorted((numbers[text], text) for text in runs.by("protocol"))
     count = len({run["folder"] for run in runs})
     return [
@@ -420,16 +408,19 @@ def facts(runs: Runs, numbers: Mapping[str, int]) -> list[str]:
     ]
 
 
+def budget_of(run: Row, each: str = "", by_processor: str = "") -> list[str]:
+    """Name a run's preset, and the minutes and steps that bound it."""
+    clock = by_processor if run["clock"] == "processor" else ""
+    minutes = [f"{run['minutes']:g} min{each}{clock}"] if run["minutes"] else []
+    return [run["preset"], *minutes, *([f"{run['iterations']} steps"] if run["iterations"] else [])]
+
+
 def _figures(runs: Runs, out: Path, curves: Path | None) -> list[Section]:
     """Draw what these runs allow, and add the pictures in ``curves``; say if matplotlib is missing."""
-    sections, plain = [], runs.where(ablation=None)
-
-    def add(title: str, path: Path | None) -> None:
-        sections.extend([Section(title, pictures=[path])] if path is not None else [])
-
+    plain = runs.where(ablation=None)
     try:
         sizes = Runs(run for run in runs if str(run["ablation"]).startswith("resolution "))
-        add("Resolution", figures.draw_resolution(out / "paper-resolution.png", sizes))
+        drawn = {"Resolution": figures.draw_resolution(out / "paper-resolution.png", sizes)}
         for scene, of_scene in plain.by("scene").items():
             rivals = {}  # the last of several budgets or seeds
             for same in of_scene.by("seed", *BUDGET).values():
@@ -440,21 +431,21 @@ def _figures(runs: Runs, out: Path, curves: Path | None) -> list[Section]:
                 first = next(iter(rivals.values()))
                 usual = 0.5 if first["origin"] == "hypernerf" else 0.0
                 at = first["metrics"]["protocol"].get("canonical_time", usual)
-                words = f"{scene}, near the canonical time"
-                drawn = figures.draw_beside(out / f"paper-canonical-{scene}.png", rivals, at, words)
-                add(f"Canonical comparison: {scene}", drawn)
+                picture, words = out / f"paper-canonical-{scene}.png", f"{scene}, near the canonical time"
+                drawn[f"Canonical comparison: {scene}"] = figures.draw_beside(picture, rivals, at, words)
         for dataset, method in product(DATASETS, METHODS[:2]):
             scenes = {run["scene"]: run for run in plain.where(method=method, origin=dataset)}
-            drawn = figures.draw_sheet(out / f"paper-views-{dataset}-{method}.png", scenes)
-            add(f"Views: {dataset}, {method}", drawn)
+            picture = out / f"paper-views-{dataset}-{method}.png"
+            drawn[f"Views: {dataset}, {method}"] = figures.draw_sheet(picture, scenes)
     except ImportError as error:
         return [Section("Figures", facts=[str(error)])]
+    sections = [Section(title, pictures=[path]) for title, path in drawn.items() if path is not None]
     for path in sorted(curves.glob("accuracy-time-*.png")) if curves is not None else ():
         if path.parent.resolve() != out.resolve():
             replace_file(out / path.name, path.read_bytes())
-    if drawn := sorted(out.glob("accuracy-time-*.png")):
+    if pictures := sorted(out.glob("accuracy-time-*.png")):
         lines = ["separate runs, with views held out: forewarp-report kind=accuracy_time"]
-        sections.append(Section("Accuracy against training time", facts=lines, pictures=drawn))
+        sections.append(Section("Accuracy against training time", facts=lines, pictures=pictures))
     return sections
 
 
@@ -499,10 +490,8 @@ def _page(tables: Sequence[PaperTable], runs: Runs, left_out: Sequence[str]) -> 
     numbers = numbered(runs)
     orders: dict[str, list[str]] = {}  # of each budget, what became of the paper's order in each row
     sections = [section for table in tables for section in _ablated(table, runs, orders, numbers)]
-    lines = [
-        [budget, len(found), *(sum(order.startswith(kind) for order in found) for kind in ORDERS)]
-        for budget, found in orders.items()
-    ]
+    counts = {b: [sum(o.startswith(kind) for o in found) for kind in ORDERS] for b, found in orders.items()}
+    lines = [[budget, len(orders[budget]), *count] for budget, count in counts.items()]
     columns = ["budget of a run", *(Column(kind, 0) for kind in ("rows", *ORDERS))]
     caption = "Rows of all tables below, by what became of the paper's order:"
     used = runs.where(ablation={variant for table in tables for variant in table.variants})
@@ -655,8 +644,7 @@ def _printed_changes(table: PaperTable, group: Group) -> dict[str, float]:
 
 def _label(run: Row, others: Sequence[Row]) -> str:
     """Name a run's budget, with what else tells it from the others."""
-    parts = [f"{run['minutes']:g} min"] if run["minutes"] else []
-    parts += [f"{run['iterations']} steps"] if run["iterations"] else []
+    parts = budget_of(run)[1:]
     for name in ("preset", "device", "threads", "clock", "tested", "held_out", "train_views"):
         several = len({other[name] for other in others}) > 1
         parts += [f"{name.replace('_', ' ').replace('tested', 'views')} {run[name]}"] if several else []

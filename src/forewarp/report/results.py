@@ -180,13 +180,21 @@ class Runs(list[Row]):
                 commands.append(overrides(typed))
         words = dict.fromkeys(chain(*commands))
         shared = [word for word in words if all(word in command for command in commands)]
-        varied: dict[str, list[str]] = {}
-        for word in words:
-            if word not in shared:
-                key, _, value = word.partition("=")
-                varied.setdefault(key, []).append(value)
+        varied = grouped(word.partition("=")[::2] for word in words if word not in shared)
         listed = [f"`{key}={','.join(values)}`" for key, values in varied.items()]
         return {"shared": " ".join(shared), "varied": listed} if commands else None
+
+
+def grouped(pairs: Iterable[tuple]) -> dict[object, list]:
+    """Gather the values of pairs by their keys.
+
+    >>> grouped([("a", 1), ("b", 2), ("a", 3)])
+    {'a': [1, 3], 'b': [2]}
+    """
+    values: dict[object, list] = {}
+    for key, value in pairs:
+        values.setdefault(key, []).append(value)
+    return values
 
 
 def read_runs(root: Path, needed: Sequence[str] = ("metrics.json",)) -> tuple[Runs, list[str]]:
@@ -225,9 +233,8 @@ def read_runs(root: Path, needed: Sequence[str] = ("metrics.json",)) -> tuple[Ru
             runs.append(row)
     left_out += [f"left out: debug runs: {debugging}"] if debugging else []
     if not runs and not left_out:
-        raise ValueError(
-            f"{root}: expected folders of runs, but got none; make some with forewarp-train, or set runs=..."
-        )
+        do = "make some with forewarp-train, or set runs=..."
+        raise ValueError(f"{root}: expected folders of runs, but got none; {do}")
     # In names that are typed overrides, drop the overrides that all such runs of a scene share.
     for of_scene in runs.where(typed=True).by("scene").values():
         names = [overrides(row["ablation"]) for row in of_scene]
@@ -293,10 +300,10 @@ def read_run(folder: Path) -> Row:
     row |= {"scene": str(config["data"]["scene"]), "seed": int(config["seed"])}
     row |= {"minutes": budget["minutes"], "iterations": budget.get("iterations")}
     row |= {"clock": protocol.get("clock") or budget.get("clock") or "wall"}
-    row |= {name: protocol.get(name) for name in ("threads", "device", "commit", "departures", "faults")}
+    told = ("threads", "device", "commit", "departures", "faults", "train_views")
+    row |= {name: protocol.get(name) for name in told}
     row |= {"torch": protocol.get("versions", {}).get("torch"), "held_out": protocol.get("held_out") or None}
     row |= {"measured": protocol.get("measured", f"all {frames} test views" if frames else None)}
-    row |= {"train_views": protocol.get("train_views")}
     row |= {"tested": int(tested) if tested.isdigit() else None}  # as of "10 of 30 test views, evenly spread"
     row |= {"counterpart": synthetic, "dataset": COUNTERPART * stands_in + dataset}
     row["origin"] = dataset.removeprefix(COUNTERPART)
@@ -420,9 +427,8 @@ def add_to_table(file: Path, rows: Iterable[Row]) -> Runs:
     rows = [row | {"command": portable(row["command"])} for row in rows]
     known += sorted(rows, key=lambda row: row["measured_at"])
     if not known:
-        raise ValueError(
-            "runs: expected measured runs that ended after minutes, but got none; set budget.minutes"
-        )
+        expected = "measured runs that ended after minutes, but got none; set budget.minutes"
+        raise ValueError(f"runs: expected {expected}")
     last = {key_of(row, KEY): row for row in sorted(known, key=lambda row: row["day"] or "")}
     runs = Runs(last[key] for key in sorted(last, key=_order))
     text, fields = io.StringIO(), (*KEY, *runs.scores(), *NUMBERS, *TEXTS)
