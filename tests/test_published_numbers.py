@@ -56,27 +56,14 @@ HYPERNERF |= fine(slice_from=1 / 250, slice_in=11 / 250) | weighed(coarse_photo=
 MARCHED = {"step": 0.5, "color_threshold": 1e-4}
 NDVG = under("budget", iterations=15_000) | under("data", rays=8192, background="white")
 NDVG |= under("model", frequencies=5, direction_frequencies=4, marching=MARCHED | {"jitter": True})
-NDVG |= under(
-    "stage.coarse",
-    share=approx(5 / 15, rel=1e-3),
-    num_voxels=[[0, 1_024_000]],
-    deformation_voxels=1.625,
-    alpha_init=1e-6,
-    color_threshold=0.0,
-    box_alpha=1e-3,
-    view_dependence=False,
-    lr_final_factor=approx(0.1 ** (5 / 20), rel=1e-3),
-)
-NDVG_FINE = {"stage.fine.curriculum.all_in": 0} | fine(
-    num_voxels=[[0, 512_000], [0.1, 1_024_000], [0.2, 2_048_000], [0.3, 160**3]],
-    deformation_voxels=approx(190**3 / 160**3, rel=1e-3),
-    alpha_init=1e-2,
-    color_threshold=None,
-    carry=False,
-    masked=True,
-    view_dependence=True,
-    lr_final_factor=approx(0.1 ** (10 / 20), rel=1e-3),
-)
+NDVG |= under("stage.coarse", num_voxels=[[0, 1_024_000]], deformation_voxels=1.625, alpha_init=1e-6)
+NDVG |= under("stage.coarse", color_threshold=0.0, box_alpha=1e-3, view_dependence=False)
+NDVG["stage.coarse.share"] = approx(5 / 15, rel=1e-3)
+NDVG["stage.coarse.lr_final_factor"] = approx(0.1 ** (5 / 20), rel=1e-3)
+NDVG_FINE = fine(num_voxels=[[0, 512_000], [0.1, 1_024_000], [0.2, 2_048_000], [0.3, 160**3]])
+NDVG_FINE |= fine(alpha_init=1e-2, color_threshold=None, carry=False, masked=True, view_dependence=True)
+NDVG_FINE |= fine(deformation_voxels=approx(190**3 / 160**3, rel=1e-3)) | {"stage.fine.curriculum.all_in": 0}
+NDVG_FINE |= fine(lr_final_factor=approx(0.1 ** (10 / 20), rel=1e-3))
 for stage, weight in (("coarse", 0.1), ("fine", 0.01)):
     rates = {"density": 0.1, "color": 0.1, "deformation": 0.1, "network": 1e-3}
     NDVG |= under(f"stage.{stage}", sink=1.0, max_gradient=0, lr=rates)
@@ -191,20 +178,11 @@ STILL = "points that never move are not looked at (weights.still)"
 UNSEEN = "the first stage never sees the last 1 images (iterations_per_time)"
 PADDED = "the grid is padded with zeros (padded)"
 FROZEN = "the grid stays as it is from 0.95 of the stage on (frozen_from)"
-FAULTS = {
-    "nerf": [],
-    "tnerf": [],
-    "dnerf": [JUMP],
-    "nerfies": [],
-    "hypernerf": ["pictures are drawn with random samples (jitter_in_pictures)"],
-    "ndvg": [JUMP, STILL],
-    "tineuvox_s": [PADDED, FROZEN],
-    "tineuvox_b": [PADDED, FROZEN],
-    "neural_volumes": [
-        "at first most rays are opaque (first_opacity)",
-        "pictures are drawn with random steps (jitter_in_pictures)",
-    ],
-}
+OPAQUE = "at first most rays are opaque (first_opacity)"
+JITTER = "pictures are drawn with random {} (jitter_in_pictures)"
+FAULTS = {"nerf": [], "tnerf": [], "dnerf": [JUMP], "nerfies": [], "hypernerf": [JITTER.format("samples")]}
+FAULTS |= {"ndvg": [JUMP, STILL], "tineuvox_s": [PADDED, FROZEN], "tineuvox_b": [PADDED, FROZEN]}
+FAULTS["neural_volumes"] = [OPAQUE, JITTER.format("steps")]
 
 
 @pytest.mark.slow
@@ -220,17 +198,13 @@ def test_faults_of_the_released_code_are_on_in_faithful_and_off_in_fast(model):
 # The paper's method by the place where it is printed: sections 3 and 4, and appendices A.2, A.4 and A.5.
 WEIGHTS_FORWARD = {"photo": 1, "flow_l1": 1e-5, "tv_density": 1e-6, "tv_flow": 1e-3, "tv_depth": 1e-1}
 NONE_PRINTED = {"static_points": 0, "moving_opacity": 0}
-ENTROPIES = {
-    "coarse": {"point_color": 1e-1, "background_entropy": 1e-2, "inpaint_diff": 0},
-    "fine": {"point_color": 1e-2, "background_entropy": 1e-3, "inpaint_diff": 1e-5},
-}
+ENTROPIES = {"coarse": {"point_color": 1e-1, "background_entropy": 1e-2, "inpaint_diff": 0}}
+ENTROPIES["fine"] = {"point_color": 1e-2, "background_entropy": 1e-3, "inpaint_diff": 1e-5}
 RATES = {"grid": 1e-1, "network": 1e-3, "flow": 1e-3} | dict.fromkeys(("density", "color", "shading"), 1e-1)
 F2 = {"features": 0, "frequencies": 5, "width": 64, "layers": 4, "bases": 15, "nodes": 0, "padding": 0}
 VIEW = {"features": 12, "frequencies": 4, "width": 64, "layers": 2}
 FORWARD = {
-    "3.4 coarse: the feature is the colour, no inpainting": {
-        "stage.coarse.effects": ["motion", "background"]
-    },
+    "3.4 coarse: the feature is the colour": {"stage.coarse.effects": ["motion", "background"]},
     "A.2 F1": under("model.radiance", grid_features=12, frequencies=5, width=128, layers=3),
     "A.2 F2": under("model.trajectory", **F2),
     "A.2 F3": under("model.inpainter", levels=4, width=64, coverage_channel=False),
@@ -240,11 +214,8 @@ FORWARD = {
     },
     "A.4 opacity at first": under("stage.coarse", start_alpha=1e-6, box_alpha=1e-3)
     | fine(start_alpha=1e-2, carry=False),
-    "A.4 ten images, and one more every 60 iterations": {
-        "stage.fine.curriculum.start": 10,
-        "stage.fine.curriculum.iterations_per_time": 60,
-        "stage.coarse.curriculum.iterations_per_time": 60,
-    },
+    "A.4 ten images, and one more every 60": under("stage.fine.curriculum", start=10, iterations_per_time=60)
+    | under("stage.coarse.curriculum", iterations_per_time=60),
     "A.5 sizes, steps and rates": under("stage.coarse", num_voxels=[[0, 67**3]], upsample=1.5, share=20)
     | fine(num_voxels=[[0, 80**3]], upsample=None, share=100)
     | {"stage.coarse.lr": RATES, "stage.fine.lr": RATES}
