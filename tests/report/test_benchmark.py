@@ -4,6 +4,7 @@ import csv
 import os
 import shutil
 import sys
+from operator import itemgetter
 from pathlib import Path
 
 import numpy as np
@@ -84,12 +85,10 @@ def test_rows_of_earlier_versions_stay(tmp_path):
     write_run(tmp_path / "runs", scene="anew", metrics=TOY, **PARTICLES)
     written = write_minutes(tmp_path / "runs", out)
     assert len(written) == 6  # the page of the other method, which compares too
-    kept = ("scene", "seed", "psnr", "views", "command")
+    kept = itemgetter("scene", "seed", "psnr", "views", "command")
     for method, rows in before.items():
         now = list(csv.DictReader((out / f"{method}.csv").read_text().splitlines()))
-        assert {tuple(row[key] for key in kept) for row in rows} <= {
-            tuple(row[key] for key in kept) for row in now
-        }
+        assert {*map(kept, rows)} <= {*map(kept, now)}
         assert len(now) == len(rows) + (method == "particles")
     text = (out / "forward.md").read_text()
     assert "| mean of" not in text  # counterparts of four datasets

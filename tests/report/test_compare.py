@@ -53,9 +53,8 @@ def test_conditions_in_which_runs_differ_are_told_and_what_one_lacks_has_no_row(
     some = {"threads": 1, "held_out": 8, "measured": "5 of 20 test views"}
     folders = runs(one=of("forward", {"psnr": 30.0, "ssim": 0.9}), two=of("backward", protocol=some))
     rows = {row[0]: row[1:] for row in compare(read_compared(folders)).rows}
-    assert list(rows) == ["all", "steps", "seconds of training", "seconds per image"] + [
-        *("threads", "test views", "views held out")
-    ]
+    measures = ["all", "steps", "seconds of training", "seconds per image"]
+    assert list(rows) == [*measures, "threads", "test views", "views held out"]
     assert rows["all"] == ["30.00", "30.00", None]  # of other views
     assert rows["threads"] == ["2", "1", None]
     assert rows["views held out"] == ["none named", "8", None]

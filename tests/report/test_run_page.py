@@ -104,13 +104,11 @@ def test_the_page_tells_what_the_run_is(tmp_path, monkeypatch):
 
 
 def test_what_a_file_says_is_text_and_never_markup(tmp_path):
-    folder = told_run(
-        tmp_path,
-        config={"data": {"scene": NASTY}, "preset": {"name": NASTY}},
-        command=f"forewarp-train {NASTY}",
-        plan={"effects": {NASTY: {"choice": NASTY, "on": True, "because": NASTY}}},
-        metrics={"protocol": {"device": NASTY, "dataset": NASTY}, "test": {NASTY: {NASTY: 1.0}}},
-    )
+    said = {"command": f"forewarp-train {NASTY}"}
+    said["config"] = {"data": {"scene": NASTY}, "preset": {"name": NASTY}}
+    said["plan"] = {"effects": {NASTY: {"choice": NASTY, "on": True, "because": NASTY}}}
+    said["metrics"] = {"protocol": {"device": NASTY, "dataset": NASTY}, "test": {NASTY: {NASTY: 1.0}}}
+    folder = told_run(tmp_path, **said)
     rows = [{"name": NASTY, "time": 0, "ability": NASTY, "scores": {"psnr": 20.0, NASTY: 1}}]
     (folder / "per_image.json").write_text(json.dumps({"images": rows}))
     page = write(folder, Media([shown(NASTY, about=NASTY)], missing=[NASTY]))
