@@ -47,7 +47,7 @@ class Fire(nn.Module):
 
 
 def convolution(inputs: int, outputs: int, side: int = 3, **more: int) -> list[nn.Module]:
-    """A convolution and its ReLU."""
+    """Make a convolution and its ReLU."""
     return [nn.Conv2d(inputs, outputs, side, **more), nn.ReLU(inplace=True)]
 
 
