@@ -14,138 +14,80 @@ from tests.support.sampled_methods import at_full_size
 from tests.support.still_cameras import moving_scene
 
 approx, BOX = pytest.approx, Box((-1, -1.5, -2), (1, 1.5, 2))
-# Keys of the composed configuration with what the publications say.
-ALONG_RAYS = {
-    "model.direction_frequencies": 4,
-    "model.sampling.open_end": True,
-    "model.sampling.inside_box": False,
-    "model.sampling.occupancy": 0,
-    "model.sampling.fine_samples": 128,
-    "model.sampling.jitter_in_pictures": False,
-    "stage.fine.lr_hold": 0,
-    "stage.fine.max_gradient": 0,
-    "stage.fine.curriculum.all_in": 0,
-}
-SYNTHETIC = ALONG_RAYS | {
-    "budget.iterations": 800_000,
-    "data.rays": 500,
-    "data.background": "white",
-    "model.position_frequencies": 10,
-    "model.skip": 6,
-    "model.sampling.samples": 64,
-    "model.sampling.density": "relu",
-    "stage.fine.lr.network": 5e-4,
-    "stage.fine.lr_final_factor": approx(0.1 ** (800 / 500), rel=1e-3),
-}
-RIG = ALONG_RAYS | {
-    "budget.iterations": 250_000,
-    "data.rays": 6144,
-    "model.position_frequencies": 8,
-    "model.warp_frequencies": 6,
-    "model.skip": 5,
-    "model.code_size": 8,
-    "model.still_points": 16_384,
-    "model.sampling.samples": 128,
-    "model.sampling.density": "softplus",
-    "stage.fine.lr.network": 1e-3,
-    "stage.fine.lr_final_factor": 0.1,
-    "stage.fine.warp_in": 80 / 250,
-}
-NERF = SYNTHETIC | {
-    "budget.iterations": 200_000,
-    "data.rays": 1024,
-    "stage.fine.lr_final_factor": approx(0.1 ** (200 / 500), rel=1e-3),
-    "objective.fine.weights": {"photo": 1.0, "coarse_photo": 1.0},
-}
-TNERF = SYNTHETIC | {"model.time_frequencies": 4, "objective.fine.weights": {"photo": 1.0}}
-DNERF = SYNTHETIC | {
-    "model.time_frequencies": 10,
-    "stage.fine.curriculum.start": 3,
-    "stage.fine.curriculum.all_in": 100 / 800,
-    "objective.fine.weights": {"photo": 1.0, "second_time": 0.0},
-}
-NERFIES = RIG | {
-    "model.camera_code_size": 2,
-    "model.elastic_samples": None,
-    "objective.fine.weights": {"photo": 1.0, "coarse_photo": 1.0, "elastic": 1e-3, "still": 1.0},
-}
-HYPERNERF = RIG | {
-    "model.ambient_frequencies": 1,
-    "model.sampling.jitter_in_pictures": True,
-    "stage.fine.slice_from": 1 / 250,
-    "stage.fine.slice_in": 11 / 250,
-    "objective.fine.weights": {"photo": 1.0, "coarse_photo": 1.0, "still": 1.0},
-}
-NDVG = {
-    "budget.iterations": 15_000,
-    "data.rays": 8192,
-    "data.background": "white",
-    "model.frequencies": 5,
-    "model.direction_frequencies": 4,
-    "model.marching": {"step": 0.5, "jitter": True, "color_threshold": 1e-4},
-    "stage.coarse.share": approx(5 / 15, rel=1e-3),
-    "stage.coarse.num_voxels": [[0, 1_024_000]],
-    "stage.coarse.deformation_voxels": 1.625,
-    "stage.coarse.alpha_init": 1e-6,
-    "stage.coarse.color_threshold": 0.0,
-    "stage.coarse.box_alpha": 1e-3,
-    "stage.coarse.view_dependence": False,
-    "stage.coarse.lr_final_factor": approx(0.1 ** (5 / 20), rel=1e-3),
-}
-NDVG_FINE = {
-    "stage.fine.num_voxels": [[0, 512_000], [0.1, 1_024_000], [0.2, 2_048_000], [0.3, 160**3]],
-    "stage.fine.deformation_voxels": approx(190**3 / 160**3, rel=1e-3),
-    "stage.fine.alpha_init": 1e-2,
-    "stage.fine.color_threshold": None,
-    "stage.fine.carry": False,
-    "stage.fine.masked": True,
-    "stage.fine.view_dependence": True,
-    "stage.fine.curriculum.all_in": 0,
-    "stage.fine.lr_final_factor": approx(0.1 ** (10 / 20), rel=1e-3),
-}
+
+
+def under(key, **numbers):
+    """Numbers by their keys of the composed configuration."""
+    return {f"{key}.{name}": number for name, number in numbers.items()}
+
+
+def fine(**numbers):
+    return under("stage.fine", **numbers)
+
+
+def sampled(**numbers):
+    return under("model.sampling", **numbers)
+
+
+def weighed(**weights):
+    return {"objective.fine.weights": {"photo": 1.0, **weights}}
+
+
+# What the publications say.
+ALONG_RAYS = sampled(open_end=True, inside_box=False, occupancy=0, fine_samples=128, jitter_in_pictures=False)
+ALONG_RAYS |= fine(lr_hold=0, max_gradient=0) | {"stage.fine.curriculum.all_in": 0}
+ALONG_RAYS |= under("model", direction_frequencies=4)
+SYNTHETIC = ALONG_RAYS | under("budget", iterations=800_000) | under("data", rays=500, background="white")
+SYNTHETIC |= under("model", position_frequencies=10, skip=6) | sampled(samples=64, density="relu")
+SYNTHETIC |= {"stage.fine.lr.network": 5e-4} | fine(lr_final_factor=approx(0.1 ** (800 / 500), rel=1e-3))
+RIG = ALONG_RAYS | under("budget", iterations=250_000) | under("data", rays=6144)
+RIG |= under("model", position_frequencies=8, warp_frequencies=6, skip=5, code_size=8, still_points=16_384)
+RIG |= sampled(samples=128, density="softplus")
+RIG |= {"stage.fine.lr.network": 1e-3} | fine(lr_final_factor=0.1, warp_in=80 / 250)
+NERF = SYNTHETIC | under("budget", iterations=200_000) | under("data", rays=1024) | weighed(coarse_photo=1.0)
+NERF |= fine(lr_final_factor=approx(0.1 ** (200 / 500), rel=1e-3))
+TNERF = SYNTHETIC | under("model", time_frequencies=4) | weighed()
+DNERF = SYNTHETIC | under("model", time_frequencies=10) | weighed(second_time=0.0)
+DNERF |= under("stage.fine.curriculum", start=3, all_in=100 / 800)
+NERFIES = RIG | under("model", camera_code_size=2, elastic_samples=None)
+NERFIES |= weighed(coarse_photo=1.0, elastic=1e-3, still=1.0)
+HYPERNERF = RIG | under("model", ambient_frequencies=1) | sampled(jitter_in_pictures=True)
+HYPERNERF |= fine(slice_from=1 / 250, slice_in=11 / 250) | weighed(coarse_photo=1.0, still=1.0)
+MARCHED = {"step": 0.5, "color_threshold": 1e-4}
+NDVG = under("budget", iterations=15_000) | under("data", rays=8192, background="white")
+NDVG |= under("model", frequencies=5, direction_frequencies=4, marching=MARCHED | {"jitter": True})
+NDVG |= under("stage.coarse", num_voxels=[[0, 1_024_000]], deformation_voxels=1.625, alpha_init=1e-6)
+NDVG |= under("stage.coarse", color_threshold=0.0, box_alpha=1e-3, view_dependence=False)
+NDVG["stage.coarse.share"] = approx(5 / 15, rel=1e-3)
+NDVG["stage.coarse.lr_final_factor"] = approx(0.1 ** (5 / 20), rel=1e-3)
+NDVG_FINE = fine(num_voxels=[[0, 512_000], [0.1, 1_024_000], [0.2, 2_048_000], [0.3, 160**3]])
+NDVG_FINE |= fine(alpha_init=1e-2, color_threshold=None, carry=False, masked=True, view_dependence=True)
+NDVG_FINE |= fine(deformation_voxels=approx(190**3 / 160**3, rel=1e-3)) | {"stage.fine.curriculum.all_in": 0}
+NDVG_FINE |= fine(lr_final_factor=approx(0.1 ** (10 / 20), rel=1e-3))
 for stage, weight in (("coarse", 0.1), ("fine", 0.01)):
-    NDVG |= {
-        f"stage.{stage}.sink": 1.0,
-        f"stage.{stage}.max_gradient": 0,
-        f"stage.{stage}.lr": {"density": 0.1, "color": 0.1, "deformation": 0.1, "network": 1e-3},
-        f"objective.{stage}.weights": {"photo": 1, "point_color": weight, "background_entropy": weight / 10}
-        | {"flow_l1": weight, "tv_deformation": 1.0, "canonical": 1000.0, "still": 0.0},
+    rates = {"density": 0.1, "color": 0.1, "deformation": 0.1, "network": 1e-3}
+    NDVG |= under(f"stage.{stage}", sink=1.0, max_gradient=0, lr=rates)
+    NDVG[f"objective.{stage}.weights"] = {
+        **{"photo": 1, "point_color": weight, "background_entropy": weight / 10, "flow_l1": weight},
+        **{"tv_deformation": 1.0, "canonical": 1000.0, "still": 0.0},
     }
 NDVG_RIG = {key: value for key, value in NDVG.items() if ".coarse" not in key} | NDVG_FINE
-NDVG_RIG |= {
-    "budget.iterations": 10_000,
-    "data.background": "black",
-    "data.canonical": 0,
-    "stage.coarse": None,
-}
+NDVG_RIG |= under("budget", iterations=10_000) | under("data", background="black", canonical=0)
+NDVG_RIG["stage.coarse"] = None
 # The NeRF of HyperNeRF's tables.
-NERF_RIG = {key: RIG[key] for key in RIG if key in SYNTHETIC} | {"model.glorot": True, "model.width": 256}
-TINEUVOX = {
-    "budget.iterations": 20_000,
-    "data.rays": 4096,
-    "model.position_frequencies": 10,
-    "model.time_frequencies": 8,
-    "model.feature_frequencies": 2,
-    "model.direction_frequencies": 4,
-    "model.marching": {"step": 0.5, "jitter": False, "color_threshold": 1e-4},
-    "stage.fine.frozen_from": 0.95,
-    "stage.fine.lr_final_factor": 0.1,
-    "stage.fine.curriculum.all_in": 0,
-    "stage.fine.max_gradient": 0,
-}
-WEIGHTS = {"photo": 1, "point_color": 1e-2, "background_entropy": 1e-3, "still": 1.0}
-PLAIN = TINEUVOX | {
-    "data.background": "white",
-    "stage.fine.lr": {"grid": 8e-2, "deformation": 6e-4, "network": 8e-4},
-    "objective.fine.weights": WEIGHTS | {"tv_grid": 0.0},
-}
-TINEUVOX_RIG = TINEUVOX | {
-    "data.background": "black",
-    "stage.fine.lr": {"grid": 1e-1, "deformation": 7e-4, "network": 1e-3},
-    "objective.fine.weights": WEIGHTS | {"tv_grid": approx(1e-5 / 4096, rel=1e-3)},
-}
-TINEUVOX_S = {"model.alpha_init": 1e-2, "model.channels": 4, "model.width": 64}
-TINEUVOX_B = {"model.alpha_init": 1e-3, "model.channels": 6, "model.width": 256}
+NERF_RIG = {key: RIG[key] for key in RIG if key in SYNTHETIC} | under("model", glorot=True, width=256)
+TINEUVOX = under("budget", iterations=20_000) | under("data", rays=4096)
+TINEUVOX |= under("model", position_frequencies=10, time_frequencies=8, feature_frequencies=2)
+TINEUVOX |= under("model", direction_frequencies=4, marching=MARCHED | {"jitter": False})
+TINEUVOX |= fine(frozen_from=0.95, lr_final_factor=0.1, max_gradient=0) | {"stage.fine.curriculum.all_in": 0}
+WEIGHTS = {"point_color": 1e-2, "background_entropy": 1e-3, "still": 1.0}
+PLAIN = TINEUVOX | under("data", background="white") | weighed(**WEIGHTS, tv_grid=0.0)
+PLAIN |= fine(lr={"grid": 8e-2, "deformation": 6e-4, "network": 8e-4})
+TINEUVOX_RIG = TINEUVOX | under("data", background="black")
+TINEUVOX_RIG |= weighed(**WEIGHTS, tv_grid=approx(1e-5 / 4096, rel=1e-3))
+TINEUVOX_RIG |= fine(lr={"grid": 1e-1, "deformation": 7e-4, "network": 1e-3})
+TINEUVOX_S = under("model", alpha_init=1e-2, channels=4, width=64)
+TINEUVOX_B = under("model", alpha_init=1e-3, channels=6, width=256)
 
 
 def growing(side, times):
@@ -236,20 +178,11 @@ STILL = "points that never move are not looked at (weights.still)"
 UNSEEN = "the first stage never sees the last 1 images (iterations_per_time)"
 PADDED = "the grid is padded with zeros (padded)"
 FROZEN = "the grid stays as it is from 0.95 of the stage on (frozen_from)"
-FAULTS = {
-    "nerf": [],
-    "tnerf": [],
-    "dnerf": [JUMP],
-    "nerfies": [],
-    "hypernerf": ["pictures are drawn with random samples (jitter_in_pictures)"],
-    "ndvg": [JUMP, STILL],
-    "tineuvox_s": [PADDED, FROZEN],
-    "tineuvox_b": [PADDED, FROZEN],
-    "neural_volumes": [
-        "at first most rays are opaque (first_opacity)",
-        "pictures are drawn with random steps (jitter_in_pictures)",
-    ],
-}
+OPAQUE = "at first most rays are opaque (first_opacity)"
+JITTER = "pictures are drawn with random {} (jitter_in_pictures)"
+FAULTS = {"nerf": [], "tnerf": [], "dnerf": [JUMP], "nerfies": [], "hypernerf": [JITTER.format("samples")]}
+FAULTS |= {"ndvg": [JUMP, STILL], "tineuvox_s": [PADDED, FROZEN], "tineuvox_b": [PADDED, FROZEN]}
+FAULTS["neural_volumes"] = [OPAQUE, JITTER.format("steps")]
 
 
 @pytest.mark.slow
@@ -265,75 +198,34 @@ def test_faults_of_the_released_code_are_on_in_faithful_and_off_in_fast(model):
 # The paper's method by the place where it is printed: sections 3 and 4, and appendices A.2, A.4 and A.5.
 WEIGHTS_FORWARD = {"photo": 1, "flow_l1": 1e-5, "tv_density": 1e-6, "tv_flow": 1e-3, "tv_depth": 1e-1}
 NONE_PRINTED = {"static_points": 0, "moving_opacity": 0}
-RATES = {"grid": 1e-1, "network": 1e-3, "flow": 1e-3}
+ENTROPIES = {"coarse": {"point_color": 1e-1, "background_entropy": 1e-2, "inpaint_diff": 0}}
+ENTROPIES["fine"] = {"point_color": 1e-2, "background_entropy": 1e-3, "inpaint_diff": 1e-5}
+RATES = {"grid": 1e-1, "network": 1e-3, "flow": 1e-3} | dict.fromkeys(("density", "color", "shading"), 1e-1)
+F2 = {"features": 0, "frequencies": 5, "width": 64, "layers": 4, "bases": 15, "nodes": 0, "padding": 0}
+VIEW = {"features": 12, "frequencies": 4, "width": 64, "layers": 2}
 FORWARD = {
-    "3.4 coarse: the feature is the colour, no inpainting": {
-        "stage.coarse.effects": ["motion", "background"],
-    },
-    "A.2 F1": {
-        "model.radiance.grid_features": 12,
-        "model.radiance.frequencies": 5,
-        "model.radiance.width": 128,
-        "model.radiance.layers": 3,
-    },
-    "A.2 F2": {
-        "model.trajectory.features": 0,
-        "model.trajectory.frequencies": 5,
-        "model.trajectory.width": 64,
-        "model.trajectory.layers": 4,
-        "model.trajectory.bases": 15,
-        "model.trajectory.nodes": 0,
-        "model.trajectory.padding": 0,
-    },
-    "A.2 F3": {
-        "model.inpainter.levels": 4,
-        "model.inpainter.width": 64,
-        "model.inpainter.coverage_channel": False,
-    },
-    "A.2 F4": {
-        "model.view_dependence.features": 12,
-        "model.view_dependence.frequencies": 4,
-        "model.view_dependence.width": 64,
-        "model.view_dependence.layers": 2,
-    },
+    "3.4 coarse: the feature is the colour": {"stage.coarse.effects": ["motion", "background"]},
+    "A.2 F1": under("model.radiance", grid_features=12, frequencies=5, width=128, layers=3),
+    "A.2 F2": under("model.trajectory", **F2),
+    "A.2 F3": under("model.inpainter", levels=4, width=64, coverage_channel=False),
+    "A.2 F4": under("model.view_dependence", **VIEW),
     "A.4 w1 to w7": {
-        "objective.coarse.weights": WEIGHTS_FORWARD
-        | NONE_PRINTED
-        | {"point_color": 1e-1, "background_entropy": 1e-2, "inpaint_diff": 0},
-        "objective.fine.weights": WEIGHTS_FORWARD
-        | NONE_PRINTED
-        | {"point_color": 1e-2, "background_entropy": 1e-3, "inpaint_diff": 1e-5},
+        f"objective.{stage}.weights": WEIGHTS_FORWARD | NONE_PRINTED | own for stage, own in ENTROPIES.items()
     },
-    "A.4 opacity at first": {
-        "stage.coarse.start_alpha": 1e-6,
-        "stage.coarse.box_alpha": 1e-3,
-        "stage.fine.start_alpha": 1e-2,
-        "stage.fine.carry": False,
-    },
-    "A.4 ten images, and one more every 60 iterations": {
-        "stage.fine.curriculum.start": 10,
-        "stage.fine.curriculum.iterations_per_time": 60,
-        "stage.coarse.curriculum.iterations_per_time": 60,
-    },
-    "A.5 sizes, steps and rates": {
-        "stage.coarse.num_voxels": [[0, 67**3]],
-        "stage.coarse.upsample": 1.5,
-        "stage.fine.num_voxels": [[0, 80**3]],
-        "stage.fine.upsample": None,
-        "model.upsampler.scale": 2,
-        "stage.coarse.lr": RATES | dict.fromkeys(("density", "color", "shading"), 1e-1),
-        "stage.fine.lr": RATES | dict.fromkeys(("density", "color", "shading"), 1e-1),
-        "budget.iterations": 120_000,
-        "stage.coarse.share": 20,
-        "stage.fine.share": 100,
-    },
+    "A.4 opacity at first": under("stage.coarse", start_alpha=1e-6, box_alpha=1e-3)
+    | fine(start_alpha=1e-2, carry=False),
+    "A.4 ten images, and one more every 60": under("stage.fine.curriculum", start=10, iterations_per_time=60)
+    | under("stage.coarse.curriculum", iterations_per_time=60),
+    "A.5 sizes, steps and rates": under("stage.coarse", num_voxels=[[0, 67**3]], upsample=1.5, share=20)
+    | fine(num_voxels=[[0, 80**3]], upsample=None, share=100)
+    | {"stage.coarse.lr": RATES, "stage.fine.lr": RATES}
+    | {"model.upsampler.scale": 2, "budget.iterations": 120_000},
 }
 ON_CAPTURES = {
-    "A.2 F2": FORWARD["A.2 F2"] | {"model.trajectory.features": 12, "model.trajectory.bases": 25},
-    "A.5 sizes, steps and rates": FORWARD["A.5 sizes, steps and rates"]
-    | {"stage.fine.num_voxels": [[0, 70**3]]},
-    "4.2 a static grid": {"stage.fine.background_num_voxels": [[0, 160**3]]},
-    "as all are measured": {"data.background": "black", "data.eval_background": "black"},
+    "A.2 F2": under("model.trajectory", **F2 | {"features": 12, "bases": 25}),
+    "A.5 sizes, steps and rates": FORWARD["A.5 sizes, steps and rates"] | fine(num_voxels=[[0, 70**3]]),
+    "4.2 a static grid": fine(background_num_voxels=[[0, 160**3]]),
+    "as all are measured": under("data", background="black", eval_background="black"),
 }
 
 

@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from forewarp.report.choices import read_compared
 from forewarp.report.figures import figure_of, save, sheets_of, thirds, view_near
+from forewarp.report.results import read_compared
 
 METHODS = ("particles", "forward", "backward")
 NEAR = 0.5  # the time of the views that are shown

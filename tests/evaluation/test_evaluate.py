@@ -87,16 +87,14 @@ def test_what_moves_is_scored_apart(run, module, tmp_path, capsys):
     images = {}
     for view in draw(module, data.targets("test")):
         rgb = list(view.renderings.values())[-1].rgb.reshape(24, 24, 3).clamp(0, 1)
-        images[view.number] = ((255 * rgb).round() - (255 * view.target.rgb).round()).square().mean(
-            -1
-        ) / 255**2
-    expected = [
-        -10 * torch.log10(images[i][chosen].mean()).item()
-        for i, chosen in enumerate((masks[0] & valid, masks[1]))
-    ]
+        images[view.number] = ((255 * rgb).round() / 255 - (255 * view.target.rgb).round() / 255).square()
+
+    def psnr_of(*chosen):
+        return [-10 * torch.log10(images[i][pixels].mean()).item() for i, pixels in enumerate(chosen)]
+
+    expected = psnr_of(masks[0] & valid, masks[1])
     assert metrics["test"]["moving"] == {"psnr": pytest.approx(sum(expected) / 2, abs=1e-4)}
-    counted = (~masks[0] & valid, ~masks[1], ~masks[2])
-    still = [-10 * torch.log10(images[i][chosen].mean()).item() for i, chosen in enumerate(counted)]
+    still = psnr_of(~masks[0] & valid, ~masks[1], ~masks[2])
     assert metrics["test"]["still"] == {"psnr": pytest.approx(sum(still) / 3, abs=1e-4)}
     rows = json.loads((tmp_path / "per_image.json").read_text())["images"]
     assert [sorted(row["parts"]) for row in rows] == [["moving", "still"], ["moving", "still"], ["still"]]

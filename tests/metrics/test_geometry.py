@@ -95,14 +95,13 @@ def test_end_points_are_their_twin():
 
 def test_end_point_refusals():
     predicted, truth = walks()
-    with pytest.raises(ValueError, match=r"true points: expected \(N, T, 3\).* but got shape \(7, 1, 3\)"):
-        end_point_error(predicted[:, :1], truth[:, :1])
-    with pytest.raises(ValueError, match=r"true points: expected .* but got shape \(0, 4, 3\)"):
-        end_point_error(predicted[:0], truth[:0])
-    with pytest.raises(
-        ValueError, match=r"predicted points: expected shape \(7, 4, 3\), but got \(7, 3, 3\)"
+    broken = predicted.clone()
+    broken[2, 1, 0] = math.nan
+    for points, true, match in (
+        (predicted[:, :1], truth[:, :1], r"true points: expected \(N, T, 3\).* but got shape \(7, 1, 3\)"),
+        (predicted[:0], truth[:0], r"true points: expected .* but got shape \(0, 4, 3\)"),
+        (predicted[:, 1:], truth, r"predicted points: expected shape \(7, 4, 3\), but got \(7, 3, 3\)"),
+        (broken, truth, r"predicted points: expected finite places, but got 1 of 84"),
     ):
-        end_point_error(predicted[:, 1:], truth)
-    predicted[2, 1, 0] = math.nan
-    with pytest.raises(ValueError, match=r"predicted points: expected finite places, but got 1 of 84"):
-        end_point_error(predicted, truth)
+        with pytest.raises(ValueError, match=match):
+            end_point_error(points, true)

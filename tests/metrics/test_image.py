@@ -5,15 +5,7 @@ import pytest
 import torch
 from torchmetrics.functional.image import structural_similarity_index_measure
 
-from forewarp.metrics.image import (
-    PSNR_CAP,
-    masked_ssim,
-    ms_ssim,
-    ms_ssim_legacy,
-    psnr,
-    quantise,
-    ssim,
-)
+from forewarp.metrics.image import PSNR_CAP, masked_ssim, ms_ssim, ms_ssim_legacy, psnr, quantise, ssim
 from tests.support import reference
 
 

@@ -4,6 +4,7 @@ from pathlib import Path
 import imageio.v3 as iio
 import pytest
 import torch
+from torch.nn import functional as F
 
 from forewarp.metrics import lpips
 from forewarp.metrics.lpips import LPIPS, find_lpips, find_lpips_weights
@@ -66,14 +67,14 @@ def test_heads_of_torchmetrics_are_version_0_1(squeeze):
         assert torch.equal(head, squeeze.state_dict()[f"head{k}"])
 
 
-ARCHITECTURES = [
-    ("squeeze", 722_496, [64, 128, 256, 384, 384, 512, 512]),
-    ("vgg", 14_714_688, [64, 128, 256, 512, 512]),
-    ("alex", 2_469_696, [64, 192, 384, 256, 256]),
-]
-
-
-@pytest.mark.parametrize(("net", "parameters", "taps"), ARCHITECTURES)
+@pytest.mark.parametrize(
+    ("net", "parameters", "taps"),
+    [
+        ("squeeze", 722_496, [64, 128, 256, 384, 384, 512, 512]),
+        ("vgg", 14_714_688, [64, 128, 256, 512, 512]),
+        ("alex", 2_469_696, [64, 192, 384, 256, 256]),
+    ],
+)
 def test_architectures(net, parameters, taps):
     features = lpips._BACKBONES[net]()
     assert sum(p.numel() for p in features.parameters()) == parameters
@@ -109,9 +110,7 @@ def test_of_a_mask_both_images_are_black_outside_and_maps_are_averaged_inside(al
         if index in taps:
             a, b = x / (x.square().sum(1, keepdim=True).sqrt() + 1e-10)
             part = ((a - b).square() * getattr(net, f"head{taps.index(index)}")[0]).sum(0)
-            total = (
-                total + torch.nn.functional.interpolate(part[None, None], mask.shape, mode="bilinear")[0, 0]
-            )
+            total = total + F.interpolate(part[None, None], mask.shape, mode="bilinear")[0, 0]
     assert net(first, second, mask) == pytest.approx(float(total[mask].mean()), rel=1e-4)
     assert net(torch.where(mask[..., None], first, second), first, mask) == 0
     assert net(first, second, mask & ~mask) is None
@@ -144,11 +143,8 @@ def test_weights_are_found_in_order(alex_file, tmp_path, monkeypatch):
         return path
 
     assert find_lpips() == {"lpips_squeeze": None, "lpips_vgg": None, "lpips_alex": None}
-    in_hub = {
-        "squeeze": touch("hub/checkpoints", "squeezenet1_1-b8a52dc0.pth"),
-        "vgg": touch("hub/checkpoints", "vgg16-397923af.pth"),
-        "alex": touch("hub/checkpoints", "alexnet-owt-7be5be79.pth"),
-    }
+    files = ("squeezenet1_1-b8a52dc0.pth", "vgg16-397923af.pth", "alexnet-owt-7be5be79.pth")
+    in_hub = {net: touch("hub/checkpoints", file) for net, file in zip(NETS, files)}
     touch("hub/checkpoints", "vgg16_bn-6c64b313.pth")
     touch("hub/checkpoints", "alex.pth")  # heads are not taken for a backbone
     assert {net: find_lpips_weights(net) for net in NETS} == in_hub
@@ -163,13 +159,14 @@ def test_weights_are_found_in_order(alex_file, tmp_path, monkeypatch):
 
 
 def test_refusals(alex_file, tmp_path, monkeypatch):
-    with pytest.raises(ValueError, match="lpips: expected a net of squeeze, vgg, alex, but got 'resnet'"):
-        find_lpips_weights("resnet")
-    with pytest.raises(ValueError, match="lpips_weights: expected an existing .* but got .*absent"):
-        find_lpips_weights("vgg", [tmp_path / "absent"])
     (tmp_path / "mine.pth").touch()
-    with pytest.raises(ValueError, match="lpips_weights: expected a file named like .*mine.pth; rename it"):
-        find_lpips_weights("vgg", [tmp_path / "mine.pth"])
+    for net, place, match in (
+        ("resnet", None, "lpips: expected a net of squeeze, vgg, alex, but got 'resnet'"),
+        ("vgg", tmp_path / "absent", "lpips_weights: expected an existing .* but got .*absent"),
+        ("vgg", tmp_path / "mine.pth", "lpips_weights: expected a file named like .*mine.pth; rename it"),
+    ):
+        with pytest.raises(ValueError, match=match):
+            find_lpips_weights(net, place)
     monkeypatch.setenv(lpips.WEIGHTS_VARIABLE, str(tmp_path / "gone"))
     with pytest.raises(ValueError, match="FOREWARP_LPIPS_WEIGHTS: expected an existing"):
         find_lpips_weights("vgg")
@@ -177,10 +174,7 @@ def test_refusals(alex_file, tmp_path, monkeypatch):
     for arguments, match in (
         (("squeeze", alex_file), "expected weights of squeeze's features with '0.weight' of shape"),
         (("alex", tmp_path / "mine.pth"), "mine.pth: expected weights of alex's features, but got EOFError"),
-        (
-            ("alex", tmp_path / "text.pth"),
-            "text.pth: expected weights of alex's features, but got Unpickling",
-        ),
+        (("alex", tmp_path / "text.pth"), "text.pth: expected weights of alex's features, but got Unp"),
     ):
         with pytest.raises(ValueError, match=match):
             LPIPS(*arguments)

@@ -107,14 +107,10 @@ def test_changes_are_against_the_same_seed(tmp_path):
 
 
 def test_scenes_and_minutes_stand_apart_and_the_page_is_named_after_most_runs(tmp_path):
-    for scene, minutes, model in (
-        ("ball", 1.0, "particles"),
-        ("ball", 3.0, "particles"),
-        ("cube", None, "forward"),
-    ):
+    for scene, minutes, model in (("ball", 1.0, "balls"), ("ball", 3.0, "balls"), ("cube", None, "forward")):
         write_run(tmp_path, scene=scene, minutes=minutes, ability="time", config={"model": {"name": model}})
     page, table = write_price_list(tmp_path, tmp_path / "out")
-    assert (page.name, table.name) == ("price-list-particles.md", "price-list-particles.csv")
+    assert (page.name, table.name) == ("price-list-balls.md", "price-list-balls.csv")
     text = page.read_text()
     heads = [line for line in text.splitlines() if line.startswith("## ")]
     assert heads == ["## ball, 1 minutes", "## ball, 3 minutes", "## cube, bounded by steps"]
@@ -126,10 +122,8 @@ def write_choice(root, choice, *, scene="ball", seed=0, on=(), psnr=30.0, model=
     more = {"scene": scene, "psnr": psnr, "against": "base"}
     folder = write_run(root, choice, seed, **more, config={"model": {"name": model}})
     if choice == "auto":
-        effects = {
-            name: {"choice": "x" if name in on else "none", "on": name in on, "because": f"{name}, 3 %"}
-            for name in ("motion", "view")
-        }
+        choices = {name: "x" if name in on else "none" for name in ("motion", "view")}
+        effects = {n: {"choice": c, "on": n in on, "because": f"{n}, 3 %"} for n, c in choices.items()}
         plan = {"overrides": [], "effects": effects, "seconds": 12.5, "evidence": {}}
         (folder / "plan.yaml").write_text(yaml.safe_dump(plan))
     return folder
@@ -173,17 +167,19 @@ def test_of_two_runs_of_a_choice_the_last_one_counts(tmp_path):
     assert rows_of(text, "ball")[0][3] == "31.00"
 
 
+def write_trial(root, trial, metric, score, views, command):
+    """A trial of a search; None for ``score``: it failed."""
+    more = {"command": command, "config": {"score": metric}, "steps": 100 + trial}
+    run = write_run(root, f"t{trial}", psnr=None, **more)
+    if score is not None:
+        (run / "score.json").write_text(json.dumps({"views": views, "scores": {metric: score}}))
+
+
 def test_trials_of_a_search_are_listed_the_best_first(tmp_path, in_tmp):
     runs = tmp_path / "runs"
     for trial, (rate, score) in enumerate([("0.001", 20.0), ("0.01", 25.5), ("3e-3", 22.0), ("0.1", None)]):
         words = f"forewarp-train model=balls preset=demo stage.fine.lr.place={rate} data.root=/home/me/scenes"
-        run = write_run(
-            runs, f"t{trial}", psnr=None, command=words, config={"score": "psnr"}, steps=100 + trial
-        )
-        if score is not None:
-            (run / "score.json").write_text(
-                json.dumps({"views": "8 held out views", "scores": {"psnr": score}})
-            )
+        write_trial(runs, trial, "psnr", score, "8 held out views", words)
     page, table = write_search(runs, tmp_path / "out")
     text, lines = page.read_text(), table.read_text().splitlines()
     assert "## ball, forward, by psnr of 8 held out views" in text
@@ -198,9 +194,7 @@ def test_trials_of_a_search_are_listed_the_best_first(tmp_path, in_tmp):
 
 def test_the_best_of_a_search_for_a_small_score_is_the_smallest(tmp_path, in_tmp):
     for trial, score in enumerate([0.3, 0.1]):
-        words, config = f"forewarp-train preset.rays={trial}", {"score": "lpips_squeeze"}
-        run = write_run(tmp_path, f"t{trial}", psnr=None, command=words, config=config)
-        (run / "score.json").write_text(json.dumps({"views": "2 views", "scores": {"lpips_squeeze": score}}))
+        write_trial(tmp_path, trial, "lpips_squeeze", score, "2 views", f"forewarp-train preset.rays={trial}")
     (in_tmp / "runs/best/ball/forward-fast-seed0").mkdir(parents=True)  # an earlier one
     text = write_search(tmp_path, tmp_path / "out")[0].read_text()
     best = "preset.rays=1 model=forward preset=fast run=runs/best/ball/forward-fast-seed0-2\n```"

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from forewarp.metrics.registry import METRICS, Metric
-from forewarp.report.choices import compare, read_compared
-from tests.support.runs_on_disk import write_run
+from forewarp.report.choices import compare
+from forewarp.report.results import read_compared
+from tests.support.runs_on_disk import write_run, write_views
 
 
 @pytest.fixture
@@ -23,11 +24,9 @@ def runs(in_tmp):
     return write
 
 
-def of(method, scores=None, **more):
-    return {
-        "protocol": {"method": method} | more.pop("protocol", {}),
-        "test": {"all": scores or {"psnr": 30.0}},
-    } | more
+def of(method, scores=None, protocol=None, **more):
+    about = {"protocol": {"method": method} | (protocol or {}), "test": {"all": scores or {"psnr": 30.0}}}
+    return about | more
 
 
 def test_runs_side_by_side_with_their_difference(ok, runs, monkeypatch):
@@ -37,12 +36,8 @@ def test_runs_side_by_side_with_their_difference(ok, runs, monkeypatch):
     runs(one=of("forward", scores | {"psnr": 31.5}, **flow), two=of("backward", scores, **flow))
     done = ok("report", "kind=compare", "runs=[one,two]")
     head, _, *rows = (line.split("  ") for line in done.out.splitlines())
-    assert [word.strip() for word in head if word] == [
-        "PSNR (dB) of test views",
-        "forward",
-        "backward",
-        "difference",
-    ]
+    heads = ["PSNR (dB) of test views", "forward", "backward", "difference"]
+    assert [word.strip() for word in head if word] == heads
     assert [[word.strip() for word in row if word] for row in rows] == [
         ["all", "31.50", "30.00", "+1.50"],
         ["LPIPS (vgg), all", "0.1000", "0.1000", "+0.0000"],
@@ -58,9 +53,8 @@ def test_conditions_in_which_runs_differ_are_told_and_what_one_lacks_has_no_row(
     some = {"threads": 1, "held_out": 8, "measured": "5 of 20 test views"}
     folders = runs(one=of("forward", {"psnr": 30.0, "ssim": 0.9}), two=of("backward", protocol=some))
     rows = {row[0]: row[1:] for row in compare(read_compared(folders)).rows}
-    assert list(rows) == ["all", "steps", "seconds of training", "seconds per image"] + [
-        *("threads", "test views", "views held out")
-    ]
+    measures = ["all", "steps", "seconds of training", "seconds per image"]
+    assert list(rows) == [*measures, "threads", "test views", "views held out"]
     assert rows["all"] == ["30.00", "30.00", None]  # of other views
     assert rows["threads"] == ["2", "1", None]
     assert rows["views held out"] == ["none named", "8", None]
@@ -83,10 +77,8 @@ def test_other_scenes_have_no_difference_and_other_kinds_of_view_no_metrics(ok, 
 
 def test_a_view_is_drawn_by_every_run_that_has_it(ok, runs, in_tmp):
     for run in runs(one=of("particles"), two=of("forward"), three=of("backward")):
-        for name in ("a", "b") if run != "three" else "b":
-            sheet = in_tmp / run / "images" / "sheets" / "test" / f"{name}.png"
-            sheet.parent.mkdir(parents=True, exist_ok=True)
-            iio.imwrite(sheet, np.zeros((3, 4 * 3 + 8, 3), np.uint8))
+        views = {f"test/{name}": (0.5, 30.0) for name in ("ab" if run != "three" else "b")}
+        write_views(in_tmp / run, views, np.zeros((3, 4 * 3 + 8, 3), np.uint8))
     done = ok("report", "kind=compare", "runs=[one,t*]", "out=out")
     assert done.out.splitlines()[-1] == "written: out/compare.png"
     assert iio.imread("out/compare.png").shape[2] == 4
@@ -111,13 +103,10 @@ def test_columns_are_named_as_far_as_needed(runs, folders, methods, names):
 def test_what_is_no_run_is_refused(runs, in_tmp):
     runs(run={})
     (in_tmp / "run" / "metrics.json").write_text(json.dumps({"protocol": {}, "test": {}}))
-    with pytest.raises(
-        ValueError, match="^run: expected a measured run, but got no key 'seconds'; measure it"
+    for folders, line in (
+        (["run"], "run: expected a measured run, but got no key 'seconds'; measure it"),
+        (["none"], "none/metrics.json: expected a run's numbers, but got none; make them"),
+        ([], "runs: expected folders of runs, but got none; set runs="),
     ):
-        read_compared(["run"])
-    with pytest.raises(
-        ValueError, match="^none/metrics.json: expected a run's numbers, but got none; make them"
-    ):
-        read_compared(["none"])
-    with pytest.raises(ValueError, match="^runs: expected folders of runs, but got none; set runs="):
-        read_compared([])
+        with pytest.raises(ValueError, match=f"^{line}"):
+            read_compared(folders)

@@ -2,31 +2,12 @@ import sys
 
 import imageio.v3 as iio
 import numpy as np
-import pytest
 
 from forewarp.report import figures
 from forewarp.report.benchmark import Published
-from forewarp.report.choices import seconds_to
 from forewarp.report.figures import MARGIN, draw_scene, pareto_front, subject, thirds
-from forewarp.report.results import Point, read_runs
+from forewarp.report.results import read_runs
 from tests.support.runs_on_disk import write_run
-
-
-def curve(*pairs):
-    return [Point(seconds, psnr, 0) for seconds, psnr in pairs]
-
-
-@pytest.mark.parametrize(
-    ("pairs", "seconds"),
-    [
-        ([(1, 24), (2, 25), (3, 26)], 2),
-        ([(1, 25), (2, 24), (3, 25), (4, 25)], 3),  # once is chance
-        ([(1, 24), (2, 25)], None),  # nothing follows that would confirm it
-        ([], None),
-    ],
-)
-def test_a_target_is_reached_twice_in_a_row(pairs, seconds):
-    assert seconds_to(curve(*pairs), 25) == seconds
 
 
 def test_the_front_is_what_nothing_beats_in_both():

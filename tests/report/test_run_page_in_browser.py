@@ -15,12 +15,7 @@ from tests.support.browser import Tab, chromium, until
 from tests.support.particles import module_with, small_data
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
-COLORS = {
-    "truth": (1.0, 0.0, 0.0),
-    "prediction": (0.0, 0.0, 1.0),
-    "error": (0.0, 0.0, 0.0),
-    "depth": (1.0, 1, 0),
-}
+COLORS = {"truth": (1.0, 0, 0), "prediction": (0.0, 0, 1), "error": (0.0, 0, 0), "depth": (1.0, 1, 0)}
 
 
 @pytest.fixture(scope="module")
@@ -30,10 +25,8 @@ def file(tmp_path_factory):
     effects = {"motion": {"choice": "dct", "on": True, "because": "a reason " * 30}}
     folder = told_run(root, views=40, plan={"effects": effects}, command="forewarp-train " + "a.b=c/" * 60)
     plain = {name: torch.tensor(color).expand(60, 80, 3) for name, color in COLORS.items()}
-    second = plain | {
-        "truth": torch.tensor([0.0, 1, 0]).expand(60, 80, 3),
-        "prediction": torch.ones(60, 80, 3),
-    }
+    green = torch.tensor([0.0, 1, 0]).expand(60, 80, 3)
+    second = plain | {"truth": green, "prediction": torch.ones(60, 80, 3)}
     views = [Shown("best", "test/r_1, 30.0 dB", plain), Shown("worst", "test/r_2, 20.0 dB", second)]
     film = write_video(root / "film.mp4", (torch.full((32, 32, 3), i / 9) for i in range(10)), fps=10)
     path = root / "page.html"
@@ -142,9 +135,8 @@ def test_without_scripts_truth_and_prediction_stand_beside_each_other(browser, f
 def test_particles_play_in_it_by_the_player_s_own_scripts_alone(browser, tmp_path):
     data = small_data()
     module = module_with(data)
-    source = Source(
-        module, "particles", [frame.camera for frame in data.scene.train], [0.0], name="</iframe>"
-    )
+    cameras = [frame.camera for frame in data.scene.train]
+    source = Source(module, "particles", cameras, [0.0], name="</iframe>")
     text, _ = player_of(source)
     media, page = Media(), tmp_path / "page.html"
     assert not media.play(text, script_digests(), 1e5)

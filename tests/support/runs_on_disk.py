@@ -3,6 +3,7 @@
 import json
 from pathlib import Path
 
+import imageio.v3 as iio
 import yaml
 
 
@@ -53,6 +54,17 @@ def write_run(
         text = "\n".join(["seconds,stage,step,psnr,epe_moving,voxels", *lines])
         (folder / "accuracy_time.csv").write_text(text + "\n")
     return folder
+
+
+def write_views(folder, views, sheet=None):
+    """What was measured of test views, name -> (time, PSNR), and a sheet (H, W, 3) of each."""
+    about = {"ability": "all"}
+    images = [{"name": n, "time": t, "scores": {"psnr": psnr}} | about for n, (t, psnr) in views.items()]
+    (folder / "per_image.json").write_text(json.dumps({"images": images}))
+    for name in views if sheet is not None else ():
+        file = folder / "images" / "sheets" / f"{name}.png"
+        file.parent.mkdir(parents=True, exist_ok=True)
+        iio.imwrite(file, sheet)
 
 
 def rows_of(text, first):

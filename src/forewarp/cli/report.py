@@ -105,8 +105,9 @@ def options_of(config: DictConfig, names: Sequence[str]) -> dict:
 
 def compared(config: DictConfig) -> str:
     """Return the table of ``kind=compare``; draw a view by each run where ``out`` is set."""
-    from forewarp.report.choices import compare, read_compared
+    from forewarp.report.choices import compare
     from forewarp.report.figures import draw_beside
+    from forewarp.report.results import read_compared
 
     named = [config.runs] if isinstance(config.runs, str) else list(config.runs or ())
     runs = read_compared([folder for name in named for folder in sorted(glob(str(name))) or [str(name)]])

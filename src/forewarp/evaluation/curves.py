@@ -58,18 +58,16 @@ class AccuracyCurve(lightning.Callback):
         if not len(trainer.datamodule.watched()):
             return
         folder = Path(trainer.default_root_dir)
-        self._path, self._before = folder.parent / FILE, seconds_before(folder)
+        done = [read_json(file) or {} for file in folder.parent.glob("*/done.json") if file.parent != folder]
+        self._path, self._before = folder.parent / FILE, sum(float(one.get("seconds", 0.0)) for one in done)
         now, rows = self._seconds(module), read_rows(self._path)
         try:
-            seconds = [float(row["seconds"]) for row in rows]
-            self._rows = [
-                {name: row[name] for name in COLUMNS} for row, at in zip(rows, seconds) if at <= now
-            ]
+            kept = [row for row in rows if float(row["seconds"]) <= now]
+            self._rows = [{name: row[name] for name in COLUMNS} for row in kept]
         except (KeyError, TypeError, ValueError) as error:
-            raise ValueError(
-                f"{self._path}: expected a table with the columns {', '.join(COLUMNS)}, but got another or "
-                "half a one; delete it, and the curve begins where training goes on"
-            ) from error
+            got = "another or half a one; delete it, and the curve begins where training goes on"
+            expected = f"a table with the columns {', '.join(COLUMNS)}"
+            raise ValueError(f"{self._path}: expected {expected}, but got {got}") from error
         last = float(self._rows[-1]["seconds"]) if self._rows else 0.0
         self._next = next_moment(last, self.first, self.ratio)
 
@@ -105,9 +103,3 @@ class AccuracyCurve(lightning.Callback):
             curve = {f"curve/{name}": value for name, value in scores.items()} | {"curve/seconds": seconds}
             module.trackers.log(curve, module.global_step)
         self._next = next_moment(seconds, self.first, self.ratio)
-
-
-def seconds_before(folder: Path) -> float:
-    """Sum the training seconds of the finished stages beside a stage's folder."""
-    done = [path for path in folder.parent.glob("*/done.json") if path.parent != folder]
-    return sum(float((read_json(path) or {}).get("seconds", 0.0)) for path in done)

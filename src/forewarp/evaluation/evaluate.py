@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import platform
+import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -129,8 +130,10 @@ def evaluate(
     on_sheets = {chosen[i] for i in spread(len(chosen), sheets)}
     rows: dict[int, dict] = {}
     for view in draw(module, targets, chosen):
-        if reduce is not None:
-            view = _reduced(view, reduce, scene.has_alpha)
+        if reduce is not None:  # the target is as small already
+            options = view.target.view.shape, reduce, view.target.background, scene.has_alpha
+            small = {name: reduced_rendering(whole, *options) for name, whole in view.renderings.items()}
+            view = replace(view, renderings=small)
         rows[view.number] = _score(view, suite)
         _save(view, images, view.number in on_sheets)
         if progress is not None:
@@ -145,26 +148,15 @@ def evaluate(
     seconds = {name: float(done["seconds"]) for name, done in finished.items()}
     clocks = [done.get("clocks", {}) for done in finished.values()]
     shared = set.intersection(*map(set, clocks)) if clocks else set()
+    about = {"scene": scene.name, **scene.protocol, **from_training(scene), **over_scene(module, scene)}
+    about |= {**protocol, **module.method.protocol(), "renderings": [*others, best], "scored": best}
+    about |= {"device": device_name(module.device), "threads": torch.get_num_threads()}
+    spent = {"train": sum(seconds.values()), **seconds}
+    spent["render_per_frame"] = fmean(row["seconds"] for row in per_image)
+    spent["render_again_per_frame"] = fmean(row["seconds_again"] for row in per_image)
     metrics = {
-        "protocol": {
-            "scene": scene.name,
-            **scene.protocol,
-            **from_training(scene),
-            **over_scene(module, scene),
-            **protocol,
-            **module.method.protocol(),
-            "renderings": [*others, best],
-            "scored": best,
-            "device": device_name(module.device),
-            "threads": torch.get_num_threads(),
-            "versions": versions(),
-        },
-        "seconds": {
-            "train": sum(seconds.values()),
-            **seconds,
-            "render_per_frame": fmean(row["seconds"] for row in per_image),
-            "render_again_per_frame": fmean(row["seconds_again"] for row in per_image),
-        },
+        "protocol": about | {"versions": versions()},
+        "seconds": spent,
         # Only clocks that all stages were counted by.
         "clocks": {kind: sum(float(clock[kind]) for clock in clocks) for kind in sorted(shared)},
         "steps": {name: int(done["steps"]) for name, done in finished.items()},
@@ -291,15 +283,8 @@ def keypoint_transfer(module: DynamicSceneModule, scene: Scene) -> dict | None:
     return {"pck_t": fmean(shares), "pairs": len(shares)} if shares else None
 
 
-def _reduced(view: RenderedView, by: int, has_alpha: bool) -> RenderedView:
-    """Average blocks of pixels of all renderings; the target is as small already."""
-    options = view.target.view.shape, by, view.target.background
-    smaller = {n: reduced_rendering(r, *options, straight=has_alpha) for n, r in view.renderings.items()}
-    return replace(view, renderings=smaller)
-
-
 def reduced_rendering(
-    rendering: Rendering, shape: tuple[int, int], by: int, background: Tensor, *, straight: bool
+    rendering: Rendering, shape: tuple[int, int], by: int, background: Tensor, straight: bool
 ) -> Rendering:
     """Average each block of ``by`` x ``by`` pixels of a whole rendered image.
 
@@ -357,10 +342,8 @@ def show(metrics: dict, folder: Path, absent: dict[str, str]) -> None:
     console.print(table_of(metrics))
     others = ("train", "render_per_frame", "render_again_per_frame")
     stages = ", ".join(f"{name} {time_text(s)}" for name, s in seconds.items() if name not in others)
-    lines = [
-        f"trained {time_text(seconds['train'])} ({stages}), {seconds['render_per_frame']:.3g} s a frame, "
-        f"{seconds['render_again_per_frame']:.3g} s another at the same time"
-    ]
+    spent, frame, again = time_text(seconds["train"]), *(f"{seconds[name]:.3g} s" for name in others[1:])
+    lines = [f"trained {spent} ({stages}), {frame} a frame, {again} another at the same time"]
     if flow and flow["epe_moving"] is not None:
         error, motion = flow["epe_moving"], flow["motion_mean"]
         share = f"{error / motion:.0%} of their motion {motion:.4f}"
@@ -409,12 +392,9 @@ def device_name(device: torch.device) -> str:
     """Return the model name of the GPU or of the processor."""
     if device.type == "cuda":
         return torch.cuda.get_device_name(device)
-    try:
-        lines = _PROCESSOR.read_text().splitlines()
-    except OSError:
-        lines = []
-    named = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
-    return next(filter(None, named), None) or platform.processor() or platform.machine()
+    about = _PROCESSOR.read_text() if _PROCESSOR.is_file() else ""
+    named = re.search(r"^model name\s*:[ \t]*(.*\S)", about, re.MULTILINE)
+    return named[1] if named else platform.processor() or platform.machine()
 
 
 def versions() -> dict[str, str]:

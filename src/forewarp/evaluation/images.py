@@ -108,19 +108,13 @@ def image_flow(
     return flow.reshape(*shape, 2), drawn.opacity.reshape(shape)
 
 
-def psnr_by_view(module: DynamicSceneModule, targets: Sequence[Target], rays: int) -> list[float]:
-    """Return PSNR (dB) of each image, from ``rays`` random pixels, the same in all."""
+def validation_psnr(module: DynamicSceneModule, targets: Sequence[Target], rays: int) -> float:
+    """Return the mean PSNR (dB) of images, each from ``rays`` random pixels, the same in all."""
     values = []
     for target in targets:
         count = target.frame.camera.width * target.frame.camera.height
         pixels = torch.randperm(count, generator=torch.Generator().manual_seed(0))[:rays]
         values.append(float(module.psnr_of(target, pixels)))
-    return values
-
-
-def validation_psnr(module: DynamicSceneModule, targets: Sequence[Target], rays: int) -> float:
-    """Return the mean of ``psnr_by_view``."""
-    values = psnr_by_view(module, targets, rays)
     return sum(values) / len(values)
 
 

@@ -28,10 +28,8 @@ def moving_rows(method: Method, frames: Sequence[Frame], key: str = "layer") -> 
     from forewarp.methods.method import HasLayers
 
     if not isinstance(method, HasLayers):
-        raise ValueError(
-            f"{key}: expected a run of particles, as they alone tell what moves, but got one of another "
-            "method; leave it out"
-        )
+        expected = "a run of particles, as they alone tell what moves"
+        raise ValueError(f"{key}: expected {expected}, but got one of another method; leave it out")
     return method.in_motion(frames)
 
 

@@ -43,10 +43,8 @@ class Trajectories:
         points: Tensor | None = None,
     ) -> None:
         if not (isinstance(module.method, HasTrajectories) and isinstance(module.method, HasMatter)):
-            got = type(module.method).__name__
-            raise ValueError(
-                f"path: expected a method that knows trajectories, but got {got}; use path=fixed"
-            )
+            got = f"{type(module.method).__name__}; use path=fixed"
+            raise ValueError(f"path: expected a method that knows trajectories, but got {got}")
         self.method, self.tail, self.width = module.method, tail, width
         # The depth of a rendered surface is uncertain by about the size of its matter.
         self.slack = 1.5 * module.method.matter().size

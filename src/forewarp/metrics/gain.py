@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import statistics
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 FACTORS = ("step", "frame", "memory", "parameters", "steps")  # measures that change by a factor
@@ -20,15 +20,16 @@ class Estimate:
     deviation: float | None = None
 
     @classmethod
-    def of(cls, values: Sequence[float]) -> Estimate | None:
-        """Estimate from values; None if there are none.
+    def of(cls, values: Iterable[float | None]) -> Estimate | None:
+        """Estimate from the values that are not None; None if there are none.
 
-        >>> Estimate.of([1.0, 3.0])
+        >>> Estimate.of([1.0, None, 3.0])
         Estimate(mean=2.0, deviation=1.4142135623730951)
         """
-        if not values:
+        known = [value for value in values if value is not None]
+        if not known:
             return None
-        return cls(statistics.fmean(values), statistics.stdev(values) if len(values) > 1 else None)
+        return cls(statistics.fmean(known), statistics.stdev(known) if len(known) > 1 else None)
 
 
 def pooled_deviation(groups: Sequence[Sequence[float]]) -> float | None:

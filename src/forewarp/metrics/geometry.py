@@ -33,11 +33,10 @@ def depth_delta(
     >>> depth_delta(torch.tensor([[1.0, 1.2, 9.0]]), torch.tensor([[1.0, 1.0, 0.0]]), thresholds=(1.1, 1.25))
     (0.5, 1.0)
     """
+    shape = tuple(truth.shape)
     for name, image in (("depth", prediction), ("foreground", foreground)):
-        if image is not None and image.shape != truth.shape:
-            raise ValueError(
-                f"{name}: expected the true depth's shape {tuple(truth.shape)}, but got {tuple(image.shape)}"
-            )
+        if image is not None and image.shape != shape:
+            raise ValueError(f"{name}: expected the true depth's shape {shape}, but got {tuple(image.shape)}")
     if min(thresholds, default=0) <= 1:
         raise ValueError(f"thresholds: expected ratios above 1, but got {thresholds}")
     prediction, truth = prediction.detach().cpu().double(), truth.cpu().double()
@@ -81,20 +80,15 @@ def end_point_error(
     >>> scores["epe_moving"], scores["epe_still"], scores["motion_mean"]
     (1.0, 0.0, 1.0)
     """
-    if truth.ndim != 3 or truth.shape[-1] != 3 or truth.shape[0] < 1 or truth.shape[1] < 2:
-        raise ValueError(
-            f"true points: expected (N, T, 3) with N >= 1 and T >= 2, but got shape {tuple(truth.shape)}"
-        )
-    if predicted.shape != truth.shape:
-        raise ValueError(
-            f"predicted points: expected shape {tuple(truth.shape)}, but got {tuple(predicted.shape)}"
-        )
+    shape = tuple(truth.shape)
+    if len(shape) != 3 or shape[-1] != 3 or shape[0] < 1 or shape[1] < 2:
+        raise ValueError(f"true points: expected (N, T, 3) with N >= 1 and T >= 2, but got shape {shape}")
+    if predicted.shape != shape:
+        raise ValueError(f"predicted points: expected shape {shape}, but got {tuple(predicted.shape)}")
     for name, points in (("predicted points", predicted), ("true points", truth)):
-        bad = int((~torch.isfinite(points)).sum())
-        if bad:
-            raise ValueError(
-                f"{name}: expected finite places, but got {bad} of {points.numel()} NaN or infinite"
-            )
+        if bad := int((~torch.isfinite(points)).sum()):
+            got = f"{bad} of {points.numel()} NaN or infinite"
+            raise ValueError(f"{name}: expected finite places, but got {got}")
     predicted, truth = predicted.detach().cpu().double(), truth.cpu().double()
     if moving_threshold is None:
         canonical = truth[:, 0]

@@ -43,18 +43,15 @@ def image_pair(prediction: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
             raise ValueError(f"{name}: expected an image (H, W, 3), but got shape {tuple(image.shape)}")
         if not image.is_floating_point():
             raise ValueError(f"{name}: expected floats in [0, 1], but got {image.dtype}; divide by 255")
-        bad = int((~torch.isfinite(image)).sum())
-        if bad:
-            raise ValueError(
-                f"{name}: expected finite values, but got {bad} of {image.numel()} NaN or infinite"
-            )
+        if bad := int((~torch.isfinite(image)).sum()):
+            got = f"{bad} of {image.numel()} NaN or infinite"
+            raise ValueError(f"{name}: expected finite values, but got {got}")
         low, high = float(image.min()), float(image.max())
         if low < -slack or high > 1 + slack:
             raise ValueError(f"{name}: expected values in [0, 1], but got [{low:.4g}, {high:.4g}]")
     if prediction.shape != target.shape:
-        raise ValueError(
-            f"prediction: expected shape {tuple(target.shape)}, but got {tuple(prediction.shape)}"
-        )
+        expected, got = tuple(target.shape), tuple(prediction.shape)
+        raise ValueError(f"prediction: expected shape {expected}, but got {got}")
     return quantise(prediction), quantise(target)
 
 

@@ -46,23 +46,18 @@ class Fire(nn.Module):
         return torch.cat([self.expand1x1(x), self.expand3x3(x)], 1).relu_()
 
 
+def convolution(inputs: int, outputs: int, side: int = 3, **more: int) -> list[nn.Module]:
+    """Make a convolution and its ReLU."""
+    return [nn.Conv2d(inputs, outputs, side, **more), nn.ReLU(inplace=True)]
+
+
 def squeezenet_features() -> nn.Sequential:
     """The convolutional part of SqueezeNet 1.1, parameter names as in torchvision."""
-    return nn.Sequential(
-        nn.Conv2d(3, 64, 3, stride=2),
-        nn.ReLU(inplace=True),
-        nn.MaxPool2d(3, 2, ceil_mode=True),
-        Fire(64, 16, 64),
-        Fire(128, 16, 64),
-        nn.MaxPool2d(3, 2, ceil_mode=True),
-        Fire(128, 32, 128),
-        Fire(256, 32, 128),
-        nn.MaxPool2d(3, 2, ceil_mode=True),
-        Fire(256, 48, 192),
-        Fire(384, 48, 192),
-        Fire(384, 64, 256),
-        Fire(512, 64, 256),
-    )
+    pool = nn.MaxPool2d(3, 2, ceil_mode=True)
+    layers = [*convolution(3, 64, stride=2), pool, Fire(64, 16, 64), Fire(128, 16, 64), pool]
+    layers += [Fire(128, 32, 128), Fire(256, 32, 128), pool]
+    layers += [Fire(256, 48, 192), Fire(384, 48, 192), Fire(384, 64, 256), Fire(512, 64, 256)]
+    return nn.Sequential(*layers)
 
 
 def vgg16_features() -> nn.Sequential:
@@ -70,7 +65,7 @@ def vgg16_features() -> nn.Sequential:
     layers, inputs = [], 3
     for width, repeats in ((64, 2), (128, 2), (256, 3), (512, 3), (512, 3)):
         for _ in range(repeats):
-            layers += [nn.Conv2d(inputs, width, 3, padding=1), nn.ReLU(inplace=True)]
+            layers += convolution(inputs, width, padding=1)
             inputs = width
         layers.append(nn.MaxPool2d(2, 2))
     return nn.Sequential(*layers[:-1])
@@ -78,20 +73,11 @@ def vgg16_features() -> nn.Sequential:
 
 def alexnet_features() -> nn.Sequential:
     """The convolutional part of AlexNet up to its last ReLU, parameter names as in torchvision."""
-    return nn.Sequential(
-        nn.Conv2d(3, 64, 11, stride=4, padding=2),
-        nn.ReLU(inplace=True),
-        nn.MaxPool2d(3, 2),
-        nn.Conv2d(64, 192, 5, padding=2),
-        nn.ReLU(inplace=True),
-        nn.MaxPool2d(3, 2),
-        nn.Conv2d(192, 384, 3, padding=1),
-        nn.ReLU(inplace=True),
-        nn.Conv2d(384, 256, 3, padding=1),
-        nn.ReLU(inplace=True),
-        nn.Conv2d(256, 256, 3, padding=1),
-        nn.ReLU(inplace=True),
-    )
+    pool = nn.MaxPool2d(3, 2)
+    layers = [*convolution(3, 64, 11, stride=4, padding=2), pool, *convolution(64, 192, 5, padding=2), pool]
+    for inputs, outputs in ((192, 384), (384, 256), (256, 256)):
+        layers += convolution(inputs, outputs, padding=1)
+    return nn.Sequential(*layers)
 
 
 _BACKBONES = {"squeeze": squeezenet_features, "vgg": vgg16_features, "alex": alexnet_features}
@@ -217,10 +203,9 @@ def _load_backbone(features: nn.Sequential, file: Path, net: str) -> None:
     state = {key.removeprefix("features."): value for key, value in stored.items()}
     for key, parameter in features.state_dict().items():
         if key not in state or state[key].shape != parameter.shape:
+            expected = f"{what} with {key!r} of shape {tuple(parameter.shape)}"
             got = f"shape {tuple(state[key].shape)}" if key in state else "none"
-            raise ValueError(
-                f"{file}: expected {what} with {key!r} of shape {tuple(parameter.shape)}, but got {got}"
-            )
+            raise ValueError(f"{file}: expected {expected}, but got {got}")
     features.load_state_dict({key: state[key] for key in features.state_dict()})
 
 

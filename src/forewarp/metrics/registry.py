@@ -63,18 +63,15 @@ class Metric:
         return f"{self.title} ({self.unit})" if self.unit else self.title
 
 
-def _of_image(name: str):
+def _of_image(name: str, *fields: str):
+    """Score by a function of ``metrics.image``, which gets these fields of the target too."""
+
     def score(prediction: Tensor, target: Target, depth: Tensor | None) -> float | None:
         from forewarp.metrics import image
 
-        return getattr(image, name)(prediction, target.rgb)
+        return getattr(image, name)(prediction, target.rgb, *(getattr(target, field) for field in fields))
 
     return score
-
-
-def _psnr(prediction: Tensor, target: Target, depth: Tensor | None) -> float | None:
-    """PSNR of the pixels that count."""
-    return _psnr_of(target.valid, prediction, target)
 
 
 def _psnr_of(chosen: Tensor | None, prediction: Tensor, target: Target) -> float | None:
@@ -84,6 +81,11 @@ def _psnr_of(chosen: Tensor | None, prediction: Tensor, target: Target) -> float
     if chosen is None:
         return psnr(prediction, target.rgb)
     return psnr(prediction[chosen][None], target.rgb[chosen][None]) if bool(chosen.any()) else None
+
+
+def _psnr_where(chosen: str):
+    """Score the PSNR of the pixels that a field of the target chooses."""
+    return lambda prediction, target, depth: _psnr_of(getattr(target, chosen), prediction, target)
 
 
 def scores_of_parts(prediction: Tensor, target: Target) -> dict[str, dict[str, float]]:
@@ -103,16 +105,6 @@ def scores_of_parts(prediction: Tensor, target: Target) -> dict[str, dict[str, f
     chosen = zip(PARTS, (valid & target.moving, valid & ~target.moving))
     found = {part: _psnr_of(pixels, prediction, target) for part, pixels in chosen}
     return {part: {"psnr": value} for part, value in found.items() if value is not None}
-
-
-def _covisible_psnr(prediction: Tensor, target: Target, depth: Tensor | None) -> float | None:
-    return _psnr_of(target.covisible, prediction, target)
-
-
-def _covisible_ssim(prediction: Tensor, target: Target, depth: Tensor | None) -> float | None:
-    from forewarp.metrics.image import masked_ssim
-
-    return masked_ssim(prediction, target.rgb, target.covisible)
 
 
 def _psnr_in_box(prediction: Tensor, target: Target, depth: Tensor | None) -> float | None:
@@ -136,68 +128,29 @@ def _depth_within(threshold: float):
     return score
 
 
+# What several metrics have in common.
+_DECIBEL, _OF_ONE_RUN = {"digits": 2, "unit": "dB"}, {"summary": False}
+_COVISIBLE, _OF_SUBJECT = {"needs_covisible": True}, {"needs_foreground": True}
+_SSIM, _MS_SSIM = {"least_side": SSIM_LEAST_SIDE}, {"least_side": MS_SSIM_LEAST_SIDE, **_OF_ONE_RUN}
+_LPIPS = {"least_side": LPIPS_LEAST_SIDE, "higher_is_better": False}
+_DEPTH = {"needs_depth": True, **_OF_SUBJECT, **_OF_ONE_RUN}
 # In the order of every table. Another package adds its own: METRICS["sharpness"] = Metric("sharpness", ...).
-METRICS: dict[str, Metric] = {
-    metric.name: metric
-    for metric in (
-        Metric("psnr", "PSNR", 2, unit="dB", score=_psnr),
-        Metric(
-            "psnr_box",
-            "PSNR in the box",
-            2,
-            unit="dB",
-            summary=False,
-            score=_psnr_in_box,
-            needs_foreground=True,
-        ),
-        Metric("ssim", "SSIM", score=_of_image("ssim"), least_side=SSIM_LEAST_SIDE),
-        Metric(
-            "ms_ssim", "MS-SSIM", summary=False, score=_of_image("ms_ssim"), least_side=MS_SSIM_LEAST_SIDE
-        ),
-        Metric(
-            "ms_ssim_legacy",
-            "MS-SSIM (legacy)",
-            summary=False,
-            score=_of_image("ms_ssim_legacy"),
-            least_side=MS_SSIM_LEAST_SIDE,
-        ),
-        Metric(
-            "dssim",
-            "DSSIM",
-            higher_is_better=False,
-            summary=False,
-            dissimilarity_of="ms_ssim",  # tables of Neural 3D Video's scenes have it so, or of ssim
-        ),
-        # Distances of different backbones are not comparable; weights are files, so the suite holds the nets.
-        *(
-            Metric(f"lpips_{net}", f"LPIPS ({net})", higher_is_better=False, least_side=LPIPS_LEAST_SIDE)
-            for net in NETS
-        ),
-        Metric("mpsnr", "mPSNR", 2, unit="dB", score=_covisible_psnr, needs_covisible=True),
-        Metric("mssim", "mSSIM", score=_covisible_ssim, needs_covisible=True, least_side=SSIM_LEAST_SIDE),
-        *(
-            Metric(
-                f"mlpips_{net}",
-                f"mLPIPS ({net})",
-                higher_is_better=False,
-                needs_covisible=True,
-                least_side=LPIPS_LEAST_SIDE,
-            )
-            for net in NETS
-        ),
-        *(
-            Metric(
-                f"depth_delta_{threshold:g}",
-                f"depth < {threshold:g}",
-                summary=False,
-                score=_depth_within(threshold),
-                needs_depth=True,
-                needs_foreground=True,
-            )
-            for threshold in THRESHOLDS
-        ),
-    )
-}
+_LISTED = (
+    Metric("psnr", "PSNR", score=_psnr_where("valid"), **_DECIBEL),
+    Metric("psnr_box", "PSNR in the box", score=_psnr_in_box, **_DECIBEL, **_OF_SUBJECT, **_OF_ONE_RUN),
+    Metric("ssim", "SSIM", score=_of_image("ssim"), **_SSIM),
+    Metric("ms_ssim", "MS-SSIM", score=_of_image("ms_ssim"), **_MS_SSIM),
+    Metric("ms_ssim_legacy", "MS-SSIM (legacy)", score=_of_image("ms_ssim_legacy"), **_MS_SSIM),
+    # Tables of Neural 3D Video's scenes have it so, or of ssim.
+    Metric("dssim", "DSSIM", higher_is_better=False, dissimilarity_of="ms_ssim", **_OF_ONE_RUN),
+    # Distances of different backbones are not comparable; weights are files, so the suite holds the nets.
+    *(Metric(f"lpips_{net}", f"LPIPS ({net})", **_LPIPS) for net in NETS),
+    Metric("mpsnr", "mPSNR", score=_psnr_where("covisible"), **_DECIBEL, **_COVISIBLE),
+    Metric("mssim", "mSSIM", score=_of_image("masked_ssim", "covisible"), **_SSIM, **_COVISIBLE),
+    *(Metric(f"mlpips_{net}", f"mLPIPS ({net})", **_LPIPS, **_COVISIBLE) for net in NETS),
+    *(Metric(f"depth_delta_{t:g}", f"depth < {t:g}", score=_depth_within(t), **_DEPTH) for t in THRESHOLDS),
+)
+METRICS: dict[str, Metric] = {metric.name: metric for metric in _LISTED}
 
 
 def metric_of(name: str) -> Metric:
@@ -262,10 +215,8 @@ class ImageSuite:
                 lacks_depth = metric.needs_depth and (predicted_depth is None or target.depth is None)
                 if metric.needs_covisible and target.covisible is None:
                     continue
-                if name in self.lpips:
-                    value = self.lpips[name](prediction, target.rgb)
-                elif name.removeprefix("m") in self.lpips:
-                    value = self.lpips[name.removeprefix("m")](prediction, target.rgb, target.covisible)
+                if net := self.lpips.get(name.removeprefix("m")):
+                    value = net(prediction, target.rgb, target.covisible if metric.needs_covisible else None)
                 elif metric.dissimilarity_of in scores:
                     value = (1 - scores[metric.dissimilarity_of]) / 2
                 elif metric.score is None or lacks_depth or (name == "psnr_box" and not self.mask_box):

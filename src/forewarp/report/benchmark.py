@@ -9,6 +9,7 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
+from itertools import chain
 from pathlib import Path
 from statistics import fmean
 from typing import NamedTuple
@@ -19,19 +20,7 @@ from forewarp.files import MOST_CONFIG, read_rows, read_text, replace_file
 from forewarp.metrics.gain import Estimate
 from forewarp.metrics.registry import metric_of
 from forewarp.report import figures
-from forewarp.report.results import (
-    CONDITIONS,
-    KEY,
-    NETS,
-    Row,
-    Runs,
-    add_to_table,
-    in_words,
-    key_of,
-    length,
-    pairs,
-    read_runs,
-)
+from forewarp.report.results import CONDITIONS, Runs, add_to_table, in_words, key_of, length, pairs, read_runs
 from forewarp.report.tables import Column, Table, rendered, score_columns
 
 OTHERS = Path(__file__).with_name("published.yaml")  # results of others
@@ -84,10 +73,8 @@ def write_minutes(folder: Path, out: Path, published: Sequence[Published] = ()) 
     for file in out.glob("*.csv"):  # of earlier calls
         named = {row.get("method") for row in read_rows(file)}
         methods |= named if named == {file.stem} and file.with_suffix(".md").is_file() else set()
-    tables = {
-        method: labelled(add_to_table(out / f"{method}.csv", runs.where(method=method)))
-        for method in sorted(methods)
-    }
+    rows = {name: add_to_table(out / f"{name}.csv", runs.where(method=name)) for name in sorted(methods)}
+    tables = {method: labelled(own) for method, own in rows.items()}
     for method, own in tables.items():
         others = {other: found for other, found in tables.items() if other != method}
         page, picture = out / f"{method}.md", out / f"{method}.png"
@@ -95,7 +82,7 @@ def write_minutes(folder: Path, out: Path, published: Sequence[Published] = ()) 
         scenes = {}
         for group in alike(plain(own)):
             by_time: dict[float, list[float]] = {}
-            for time, psnr in (pair for row in group for pair in pairs(row["views"])):
+            for time, psnr in chain(*(pairs(row["views"]) for row in group)):
                 by_time.setdefault(time, []).append(psnr)
             label = f"{length(group[0]['minutes'])}, {len(group)} seed{'s' * (len(group) > 1)}"
             means = {label: [(time, fmean(by_time[time])) for time in sorted(by_time)]} if by_time else {}
@@ -108,12 +95,10 @@ def write_minutes(folder: Path, out: Path, published: Sequence[Published] = ()) 
 def _timed(folder: Path) -> tuple[Runs, list[str]]:
     """Read the measured runs of so many minutes, the newest of equal ones; and a line for each other run."""
     runs, left_out = read_runs(folder)
-    endless = runs.where(minutes=None)
-    runs, older = Runs(row for row in runs if row["minutes"] is not None).newest(*KEY)
-    left_out += [f"{row['folder'].relative_to(folder)}: no budget.minutes" for row in endless]
-    return runs, left_out + [
-        f"{row['folder'].relative_to(folder)}: another run of the same is newer" for row in older
-    ]
+    endless = [(row, "no budget.minutes") for row in runs.where(minutes=None)]
+    runs, older = Runs(row for row in runs if row["minutes"] is not None).newest("method", "seed", *TASK)
+    unused = [*endless, *((row, "another run of the same is newer") for row in older)]
+    return runs, left_out + [f"{row['folder'].relative_to(folder)}: {why}" for row, why in unused]
 
 
 def labelled(runs: Runs) -> Runs:
@@ -145,14 +130,13 @@ def size_of(group: Runs) -> float:
     return group.mean("size") or group[0]["density"] or 0.0
 
 
-def row_of(group: Runs, **more: object) -> Row:
+def row_of(group: Runs, **more: object) -> dict:
     """Make the row of tables for runs that differ in the seed; ``took``: the minutes that they took."""
     took = length(group[0]["minutes"]).removesuffix(" min") + group.taken()[1]
     step, error = group.mean("step"), group.estimate("motion_error")
     moving = error and Estimate(*(part and 100 * part for part in (error.mean, error.deviation)))
-    return group.summary(
-        took=took, ms=step and 1000 * step, moving=moving, particles=size_of(group) or None, **more
-    )
+    more |= {"ms": step and 1000 * step, "moving": moving, "particles": size_of(group) or None}
+    return group.summary(took=took, **more)
 
 
 def _of_method(method: str, runs: Runs, others: Mapping[str, Runs]) -> dict:
@@ -164,20 +148,22 @@ def _of_method(method: str, runs: Runs, others: Mapping[str, Runs]) -> dict:
 
     abilities = {"psnr_space": "space", "psnr_time": "time", "psnr_canonical": "canonical"}
     shared = {(row["scene"], row["minutes"]) for row in runs}
-    rivals = (row for found in others.values() for row in found if (row["scene"], row["minutes"]) in shared)
-    known = Runs(
-        r for r in (*runs, *rivals) if any(r[name] is not None for name in (*abilities, "motion_error"))
-    )
+    rivals = (row for row in chain(*others.values()) if (row["scene"], row["minutes"]) in shared)
+    told = (*abilities, "motion_error")
+    known = Runs(row for row in (*runs, *rivals) if any(row[name] is not None for name in told))
     columns = BEGIN | {"name": "method", "seeds": Column("seeds", 0)} | abilities
     columns |= {"moving": Column("moving points (%)", 1)}
     by_ability = [row_of(group, name=f"`{group[0]['method']}`") for group in alike(plain(known))]
 
     sized = Runs(row for row in runs if row["size"] and not REDUCED.search(row["pictures"] or ""))
-    density = {"density": Column("density", 0), "particles": Column("particles", 0)}
+    density = with_seeds | {"density": Column("density", 0), "particles": Column("particles", 0)} | scores
     minutes = _against_fewer(plain(runs), "minutes", lambda group: group[0]["minutes"])
+    denser = _against_fewer(sized, "density", size_of)
+    larger = _larger(runs.where(density=None))
+    pictures = with_seeds | {"pictures": "images"} | scores
+    costs = BEGIN | {name: replace(column, spread=False) for name, column in COSTS.items()}
     return {
         "method": method,
-        "nets": NETS,
         "noise": NOISE,
         "machine": made_on(runs),
         "versions": len({row["commit"] or row["day"] for row in runs}),
@@ -186,17 +172,9 @@ def _of_method(method: str, runs: Runs, others: Mapping[str, Runs]) -> dict:
         "beside": {other: _beside(method, runs, other, found) for other, found in others.items()},
         "abilities": Table.of(by_ability, columns),
         "more_minutes": Table.of(minutes, with_seeds | scores | {"verdict": "against fewer minutes"}),
-        "more_density": Table.of(
-            _against_fewer(sized, "density", size_of),
-            with_seeds | density | scores | {"verdict": "against fewer"},
-        ),
-        "larger": Table.of(
-            _larger(Runs(row for row in runs if row["density"] is None)),
-            with_seeds | {"pictures": "images"} | scores | {"verdict": "the larger is"},
-        ),
-        "costs": Table.of(
-            map(row_of, groups), BEGIN | {n: replace(c, spread=False) for n, c in COSTS.items()}
-        ),
+        "more_density": Table.of(denser, density | {"verdict": "against fewer"}),
+        "larger": Table.of(larger, pictures | {"verdict": "the larger is"}),
+        "costs": Table.of(map(row_of, groups), costs),
         "command": runs.command(),
     }
 
@@ -220,12 +198,12 @@ def _by_minutes(runs: Runs) -> Table:
     return Table(["scene", *map(length, minutes)], lines, "PSNR (dB) of test views." + about)
 
 
-def _against_fewer(runs: Runs, varied: str, order: Callable[[Runs], float]) -> list[Row]:
+def _against_fewer(runs: Runs, varied: str, order: Callable[[Runs], float]) -> list[dict]:
     """List groups that differ in one thing alone, each with how its PSNR is to that of the group before."""
+    shared, lines = [name for name in TASK if name != varied], []
     series: dict[tuple, list[Runs]] = {}
     for group in alike(runs):
-        series.setdefault(key_of(group[0], (name for name in TASK if name != varied)), []).append(group)
-    lines = []
+        series.setdefault(key_of(group[0], shared), []).append(group)
     for groups in (sorted(found, key=order) for found in series.values() if len(found) > 1):
         psnr = [None, *(group.mean("psnr") for group in groups)]
         for group, before, now in zip(groups, psnr, psnr[1:]):
@@ -243,7 +221,7 @@ def held(before: float, now: float) -> str:
     return f"holds ({change:+.2f} dB)" if change >= -NOISE - 1e-9 else f"falls by {-change:.2f} dB"
 
 
-def _larger(runs: Runs) -> list[Row]:
+def _larger(runs: Runs) -> list[dict]:
     """List runs on larger pictures, reduced to be scored, each before those that learned from small ones."""
     groups, lines = alike(runs), []
     for group in groups:
@@ -272,14 +250,8 @@ def _beside(method: str, runs: Runs, other: str, rivals: Runs) -> Table:
                 seeds, psnr = f"{len(group)} and {len(rival)}", (g.estimate("psnr") for g in (group, rival))
                 verdicts = (above(group, rival, name) for name in names)
                 lines.append([line["label"], line["took"], seeds, *psnr, *verdicts])
-    columns = [
-        *BEGIN.values(),
-        "seeds",
-        f"`{method}`",
-        f"`{other}`",
-        *(metric_of(name).title for name in names),
-    ]
-    return Table(columns, lines)
+    titles = [metric_of(name).title for name in names]
+    return Table([*BEGIN.values(), "seeds", f"`{method}`", f"`{other}`", *titles], lines)
 
 
 def above(group: Runs, other: Runs, name: str = "psnr") -> str:
@@ -291,7 +263,7 @@ def above(group: Runs, other: Runs, name: str = "psnr") -> str:
     'worse by 0.1000'
     """
     own, its, metric = group.mean(name), other.mean(name), metric_of(name)
-    if own is None or its is None:
+    if None in (own, its):
         return ""
     if not round(abs(own - its), metric.digits):
         return "equal"
@@ -313,7 +285,7 @@ def _write_lengths(tables: Mapping[str, Runs], out: Path, published: Sequence[Pu
             compared[", ".join([of_task[0]["scene"], *words])] = lengths
     scenes, pictures, used, shown = [], [], Runs(), {}
     for title, lengths in sorted(compared.items()):
-        own = [row for groups in lengths.values() for group in groups for row in group]
+        own = [*chain(*chain(*lengths.values()))]
         beside = [other for other in published if other.dataset == own[0]["dataset"]]
         picture = out / f"accuracy-time-{re.sub(r'[^a-zA-Z0-9]+', '-', title).strip('-')}.png"
         points = {
@@ -371,7 +343,7 @@ def write_methods(folder: Path, out: Path) -> list[Path]:
         tables = [_reached(group, own) for group in own.by("minutes", *CONDITIONS).values()]
         scenes.append({"name": scene, "pictures": pictures, "tables": tables})
         written += drawn
-    about = {"machine": made_on(runs), "nets": NETS, "command": runs.command()}
+    about = {"machine": made_on(runs), "command": runs.command()}
     about |= {"presets": list(runs.by("preset")), "departures": _departures(runs), "left_out": left_out}
     with_steps = (out / "faithful-step.md").is_file()  # by python -m tests.bench.faithful
     replace_file(page, rendered("methods.md.j2", scenes=scenes, with_steps=with_steps, **about))
@@ -393,13 +365,9 @@ def _pictures(scene: str, runs: Runs, out: Path, earlier: str) -> tuple[list[dic
     now = {(row["name"], f"{row['psnr'] or 0.0:.2f}", f"{row['minutes']:g}") for row in runs}
     curves, views = out / f"methods-{scene}.png", out / f"methods-{scene}-views.png"
     pictures, drawn = [], []
+    draw_curves = partial(figures.draw_curves, title=f"{scene}, {minutes} minutes")
     for path, words, shown, draw in (
-        (
-            curves,
-            "PSNR against seconds of training",
-            first,
-            partial(figures.draw_curves, title=f"{scene}, {minutes} minutes"),
-        ),
+        (curves, "PSNR against seconds of training", first, draw_curves),
         (views, "Test views, the truth first,", seen, figures.draw_views),
     ):
         known = SHOWN.search(earlier.partition(f"]({path.name})")[0]) if path.is_file() else None
@@ -424,17 +392,16 @@ def _reached(runs: Runs, others: Runs) -> Table:
     """List all numbers of the runs of a scene that may be compared, the best PSNR first."""
     groups = sorted(runs.by("name").values(), key=lambda group: -(group.mean("psnr") or 0.0))
     columns = {"title": "method", "seeds": Column("seeds", 0)} | score_columns(others.scores())
-    names = {"steps": Column("steps", 0), "step": Column("s a step", 3), "frame": Column("s a frame")}
-    names |= {"parameters": Column("parameters (M)"), "memory": Column("GiB")}
-    columns |= {name: replace(column, spread=False) for name, column in names.items()}
+    costs = COSTS | {"step": Column("s a step", 3), "frame": Column("s a frame")}
+    names = ("steps", "step", "frame", "parameters", "memory")
+    columns |= {name: replace(costs[name], spread=False) for name in names}
     measured = sorted({row["measured"] for row in runs if row["measured"]})
     words = in_words(runs[0], others, [name for name in CONDITIONS if name != "measured"])
     about = ", ".join([runs[0]["scene"], f"{runs[0]['minutes']:g} minutes", *words, *measured])
-    titled = [
-        group.summary(title=f"`{group[0]['name']}`" + " (the paper's)" * (group[0]["method"] == "forward"))
-        for group in groups
-    ]
-    return Table.of(titled, columns, f"**{about}**")
+    paper = {"forward": " (the paper's)"}
+    titles = [f"`{group[0]['name']}`{paper.get(group[0]['method'], '')}" for group in groups]
+    rows = (group.summary(title=title) for group, title in zip(groups, titles))
+    return Table.of(rows, columns, f"**{about}**")
 
 
 def _departures(runs: Runs) -> Table:

@@ -9,7 +9,8 @@ import math
 import re
 import shlex
 from collections.abc import Mapping, Sequence
-from itertools import count
+from dataclasses import replace
+from itertools import chain, count
 from pathlib import Path
 from statistics import mode
 
@@ -17,28 +18,11 @@ from forewarp.files import read_json, replace_file
 from forewarp.metrics.gain import FACTORS, Estimate, measure_effect
 from forewarp.metrics.registry import METRICS, metric_of
 from forewarp.report.figures import draw_scene
-from forewarp.report.results import (
-    KINDS,
-    PLACES,
-    UNREADABLE,
-    Point,
-    Row,
-    Runs,
-    overrides,
-    portable,
-    read_run,
-    read_runs,
-    unreadable,
-)
-from forewarp.report.tables import Column, Difference, Table, rendered
+from forewarp.report.results import KINDS, PLACES, Point, Row, Runs, overrides, portable, read_runs
+from forewarp.report.tables import Column, Difference, Table, rendered, score_columns
 
-COSTS = {
-    "epe": Column("EPE", 4),
-    "step": Column("s/step", 3),
-    "frame": Column("s/frame"),
-    "memory": Column("GiB"),
-}
-COSTS |= {"parameters": Column("parameters (M)", 3), "steps": Column("steps", 0)}
+COSTS = {"epe": Column("EPE", 4), "step": Column("s/step", 3), "frame": Column("s/frame")}
+COSTS |= {"memory": Column("GiB"), "parameters": Column("parameters (M)", 3), "steps": Column("steps", 0)}
 CHOICES = {"auto": "planned", "base": "the preset", "all_effects": "every effect", "no_effects": "none"}
 LEAST = 0.1  # dB; a smaller difference counts as none
 
@@ -47,16 +31,17 @@ def seconds_to(points: Sequence[Point], psnr: float) -> float | None:
     """Return the seconds until two evaluations in a row first reach a PSNR (dB); None if none do.
 
     >>> curve = [Point(s, p, 0) for s, p in [(1, 20), (2, 25), (4, 24), (8, 26), (16, 27)]]
-    >>> seconds_to(curve, 25), seconds_to(curve, 27)
-    (8, None)
+    >>> seconds_to(curve, 25), seconds_to(curve, 27), seconds_to([], 25)
+    (8, None, None)
     """
     steps = zip(points, points[1:])
     return next((a.seconds for a, b in steps if a.psnr >= psnr and b.psnr >= psnr), None)
 
 
-def by_variant(runs: Runs) -> dict[str, Runs]:
-    """Group runs that differ only in the seed; the base first."""
-    return dict(sorted(runs.by("variant").items(), key=lambda item: item[0] != "base"))
+def by_variant(runs: Runs, *names: str) -> dict:
+    """Group runs by variant, and by ``names`` too, as ``Runs.by`` does; the base first."""
+    groups = runs.by("variant", *names)
+    return dict(sorted(groups.items(), key=lambda item: item[1][0]["variant"] != "base"))
 
 
 def _read(folder: Path, needed: Sequence[str] = ("metrics.json",)) -> tuple[Runs, list[str]]:
@@ -84,9 +69,7 @@ def write_accuracy_time(
     runs, left_out = _read(folder, ["accuracy_time.csv", "metrics.json"])
     scenes, written = [], []
     for scene, found in runs.by("scene").items():
-        groups = {}
-        for variant, group in by_variant(found).items():
-            groups |= {(variant, minutes): same for minutes, same in group.by("minutes").items()}
+        groups = by_variant(found, "minutes")
         name = "accuracy-time-" + re.sub(r"[^\w.-]+", "-", scene).strip("-")
         picture, file = out / f"{name}.png", out / f"{name}.csv"
         beside = [other for other in published if other.dataset == found[0]["dataset"]]
@@ -126,21 +109,14 @@ def cheapest(groups: Mapping[tuple, Runs]) -> Table:
 def variants(groups: Mapping[tuple, Runs], target: float) -> Table:
     """List for every variant the seconds to the target PSNR and the final numbers."""
     columns = {"variant": "variant", "minutes": Column("minutes", None), "seeds": Column("seeds", 0)}
-    columns |= {
-        "reached": Column(f"seconds to {target:g} dB", 1),
-        "psnr": "PSNR at the end",
-        "epe": COSTS["epe"],
-    }
+    columns |= {"reached": Column(f"seconds to {target:g} dB", 1), "psnr": "PSNR at the end"}
+    columns |= {name: COSTS[name] for name in ("epe", "steps")}
     lines = []
     for group in groups.values():
-        ends = Runs(row | row["points"][-1]._asdict() for row in group if row["points"])
-        lines.append(
-            group.summary(
-                reached=reached(group, target), psnr=ends.estimate("psnr"), epe=ends.estimate("epe")
-            )
-        )
-    caption = "At equal minutes; the steps that were done in them:"
-    return Table.of(lines, columns | {"steps": COSTS["steps"]}, caption)
+        ends = Runs(row["points"][-1]._asdict() for row in group if row["points"])
+        at_the_end = {name: ends.estimate(name) for name in ("psnr", "epe")}
+        lines.append(group.summary(reached=reached(group, target), **at_the_end))
+    return Table.of(lines, columns, "At equal minutes; the steps that were done in them:")
 
 
 def write_price_list(folder: Path, out: Path) -> list[Path]:
@@ -154,19 +130,17 @@ def write_price_list(folder: Path, out: Path) -> list[Path]:
         bound = f"{minutes:g} minutes" if minutes else "bounded by steps"
         scenes.append({"title": f"{scene}, {bound}", "tables": [references(found), changes(found)]})
     model = mode([row["method"] for row in runs] or ["forward"])
-    name = "price-list" if model == "forward" else f"price-list-{model}"
+    page = out / ("price-list.md" if model == "forward" else f"price-list-{model}.md")
     text = rendered("price_list.md.j2", machine=runs.machines(), scenes=scenes, left_out=left_out)
-    replace_file(out / f"{name}.md", text)
-    replace_file(out / f"{name}.csv", every_run(runs).csv())
-    return [out / f"{name}.md", out / f"{name}.csv"]
+    replace_file(page, text)
+    replace_file(page.with_suffix(".csv"), every_run(runs).csv())
+    return [page, page.with_suffix(".csv")]
 
 
 def measures_of(runs: Runs) -> dict[str, Column]:
     """Return the column of every metric and cost."""
-    known = {
-        name: metric_of(name) for name in runs.scores() if name != "lpips" or runs.mean(name) is not None
-    }
-    return {name: Column(metric.heading, metric.digits) for name, metric in known.items()} | COSTS
+    known = [name for name in runs.scores() if name != "lpips" or runs.mean(name) is not None]
+    return score_columns(known, with_unit=True) | COSTS
 
 
 def against(row: Row, runs: Runs) -> str:
@@ -182,9 +156,8 @@ def references(runs: Runs) -> Table:
     lines = [group.summary() for variant, group in by_variant(runs).items() if variant in names]
     views = {"all": "all test views", "time": "test views between the training times"}
     columns = {"variant": "compared with", "seeds": Column("seeds", 0)} | measures_of(runs)
-    return Table.of(
-        lines, columns, f"Of {', '.join(sorted(views.get(kind, kind) for kind in runs.by('ability')))}:"
-    )
+    kinds = sorted(views.get(kind, kind) for kind in runs.by("ability"))
+    return Table.of(lines, columns, f"Of {', '.join(kinds)}:")
 
 
 def changes(runs: Runs) -> Table:
@@ -192,13 +165,11 @@ def changes(runs: Runs) -> Table:
     measures, lines = measures_of(runs), []
     for variant, group in by_variant(runs).items():
         if variant != (other := against(group[0], runs)):
-            before = {row["seed"]: row for row in runs.where(variant=other)}
-            pairs = [(row, before[row["seed"]]) for row in group if row["seed"] in before]
+            pairs = group.paired(runs.where(variant=other))
             lines.append([variant, other, len(pairs), *(measure_effect(pairs, name) for name in measures)])
     columns = ["variant", "against", Column("seeds", 0)]
     for name, column in measures.items():
-        signed = Column(column.name, column.digits, signed=True)
-        columns.append(Column(column.name, prefix="×") if name in FACTORS else signed)
+        columns.append(Column(column.name, prefix="×") if name in FACTORS else replace(column, signed=True))
     return Table(columns, lines, "Changes:")
 
 
@@ -214,53 +185,26 @@ def write_effects(folder: Path, out: Path) -> list[Path]:
     any other method.
     """
     runs, left_out = _read(folder)
-    runs, files = Runs(row for row in runs if row["ablation"] in CHOICES), []
+    runs, files = runs.where(ablation=tuple(CHOICES)), []
+    columns = {"scene": "scene", "ablation": "choice", "seed": "seed", "minutes": "minutes", "psnr": "PSNR"}
+    columns |= {"steps": "steps", "planning": "planning, s", "command": "command"}
     for model, own in (runs.by("method") or {"forward": runs}).items():
-        name = "effects" if model == "forward" else f"effects-{model}"
+        page = out / ("effects.md" if model == "forward" else f"effects-{model}.md")
         newest, _ = own.newest("scene", "ablation", "seed")
-        planned = [
-            row for found in newest.where(ablation="auto").by("scene", "seed").values() for row in found
-        ]
-        first = {row["scene"]: row["plan"].get("effects", {}) for row in reversed(planned)}
-        text = rendered(
-            "effects.md.j2",
-            model=model,
-            machine=own.machines(),
-            table=choices(newest),
-            reasons=reasons(first),
-            left_out=left_out,
-        )
-        replace_file(out / f"{name}.md", text)
-        columns = {
-            "scene": "scene",
-            "ablation": "choice",
-            "seed": Column("seed", 0),
-            "minutes": Column("minutes", None),
-        }
-        columns |= {
-            "psnr": Column("PSNR", 3),
-            "steps": COSTS["steps"],
-            "planning": "planning, s",
-            "command": "command",
-        }
+        planned = chain(*newest.where(ablation="auto").by("scene", "seed").values())
+        first = {row["scene"]: row["plan"].get("effects", {}) for row in reversed([*planned])}
+        about = {"model": model, "machine": own.machines(), "left_out": left_out}
+        decisions = [(scene, *decided) for scene in sorted(first) for decided in first[scene].items()]
+        why = [[scene, name.replace("_", " "), d["choice"], d["because"]] for scene, name, d in decisions]
+        reasons = Table(["scene", "effect", "choice", "because"], why)
+        replace_file(page, rendered("effects.md.j2", **about, table=choices(newest), reasons=reasons))
         lines = [
             row | {"planning": row["plan"].get("seconds"), "command": portable(row["command"])}
-            for found in own.by("scene", "ablation", "seed").values()
-            for row in found
+            for row in chain(*own.by("scene", "ablation", "seed").values())
         ]
-        replace_file(out / f"{name}.csv", Table.of(lines, columns).csv())
-        files += [out / f"{name}.md", out / f"{name}.csv"]
+        replace_file(page.with_suffix(".csv"), Table.of(lines, columns).csv())
+        files += [page, page.with_suffix(".csv")]
     return files
-
-
-def reasons(effects: Mapping[str, Mapping]) -> Table:
-    """List for every scene what was planned of each effect, and why."""
-    lines = [
-        [scene, name.replace("_", " "), decision["choice"], decision["because"]]
-        for scene in sorted(effects)
-        for name, decision in effects[scene].items()
-    ]
-    return Table(["scene", "effect", "choice", "because"], lines)
 
 
 def choices(runs: Runs) -> Table:
@@ -278,16 +222,13 @@ def choices(runs: Runs) -> Table:
         best = max(means, key=means.get) if means and planned else None
         change, verdict = None, ""
         if best is not None:
-            before = {row["seed"]: row for row in by_choice[best]}
-            pairs = [(row, before[row["seed"]]) for row in planned if row["seed"] in before]
+            pairs = planned.paired(by_choice[best])
             change = measure_effect(pairs, "psnr")
             verdict = _verdict(change, len(pairs)) + f", {CHOICES[best]}"
         minutes = " or ".join(f"{minutes:g}" for minutes in found.by("minutes") if minutes)
-        planning = Estimate.of([row["plan"]["seconds"] for row in planned if row["plan"]])
-        psnr = [by_choice[name].estimate("psnr") for name in present]
-        lines.append(
-            [scene, max(len(own) for own in by_choice.values()), minutes, *psnr, change, verdict, planning]
-        )
+        planning = Estimate.of(row["plan"]["seconds"] for row in planned if row["plan"])
+        psnr, seeds = [own.estimate("psnr") for own in by_choice.values()], max(map(len, by_choice.values()))
+        lines.append([scene, seeds, minutes, *psnr, change, verdict, planning])
     return Table(columns, lines)
 
 
@@ -307,9 +248,7 @@ def write_search(folder: Path, out: Path) -> list[Path]:
     """Write ``search.md``, and a CSV file a scene: the trials of ``sweeps=search``, the best first."""
     runs, left_out = read_runs(folder, ["score.json"])
     searches, written = [], []
-    for (scene, method, metric), found in (
-        Runs(row for run in runs for row in _scored(run)).by(*SEARCHED).items()
-    ):
+    for (scene, method, metric), found in Runs(chain(*map(_scored, runs))).by(*SEARCHED).items():
         known = metric_of(metric)
         best_first = sorted(found, key=lambda row: row["score"], reverse=known.higher_is_better)
         table = _trials(best_first, Column(known.heading, known.digits))
@@ -319,8 +258,7 @@ def write_search(folder: Path, out: Path) -> list[Path]:
         replace_file(file, table.csv())
         searches.append({"title": title, "table": table, **_again(best_first[0])})
         written.append(file)
-    text = rendered("search.md.j2", searches=searches, left_out=left_out)
-    replace_file(out / "search.md", text)
+    replace_file(out / "search.md", rendered("search.md.j2", searches=searches, left_out=left_out))
     return [out / "search.md", *written]
 
 
@@ -341,10 +279,9 @@ def _trials(trials: Sequence[Row], score: Column) -> Table:
     typed = [dict(word.partition("=")[::2] for word in overrides(row["command"])) for row in trials]
     keys = dict.fromkeys(key for words in typed for key in words if key not in ("run", "forewarp-train"))
     chosen = [key for key in keys if len({words.get(key) for words in typed}) > 1]
-    rows = [
-        [number + 1, *(_value(words.get(key)) for key in chosen), row["score"], row["steps"], row["seconds"]]
-        for number, (row, words) in enumerate(zip(trials, typed))
-    ]
+    cells = [[_value(words.get(key)) for key in chosen] for words in typed]
+    ends = [[row["score"], row["steps"], row["seconds"]] for row in trials]
+    rows = [[rank, *begin, *end] for rank, (begin, end) in enumerate(zip(cells, ends), 1)]
     columns = [Column("rank", 0), *(Column(key, None) for key in chosen)]
     return Table([*columns, score, Column("steps", 0), Column("seconds", 1)], rows)
 
@@ -386,7 +323,7 @@ def compare(runs: dict[str, Row]) -> Table:
     says why there are no differences, or no metrics.
 
     Args:
-        runs: as of ``read_compared``.
+        runs: as of ``results.read_compared``.
     """
     rows, lines, two = list(runs.values()), [], len(runs) == 2
     same_scene = len({(row["dataset"], row["scene"]) for row in rows}) == 1
@@ -418,33 +355,3 @@ def compare(runs: dict[str, Row]) -> Table:
         kinds = (f"{name}: {', '.join(row['test']) or 'none'}" for name, row in runs.items())
         told.append(f"no metrics: no kind of test view was measured in all runs ({'; '.join(kinds)})")
     return Table(["PSNR (dB) of test views", *runs, *["difference"] * two], lines, "\n".join(told))
-
-
-def read_compared(folders: Sequence[str | Path]) -> dict[str, Row]:
-    """Read runs, named by their methods if these differ, else by as much of their folders as needed.
-
-    Raises:
-        ValueError: if there is no folder, or one that holds no measured run.
-    """
-    if not folders:
-        raise ValueError("runs: expected folders of runs, but got none; set runs=[FOLDER,FOLDER]")
-    rows, paths = [], [Path(folder) for folder in folders]
-    for path in paths:
-        again = f"forewarp-evaluate run={path}"
-        if not (path / "metrics.json").is_file():
-            raise ValueError(
-                f"{path / 'metrics.json'}: expected a run's numbers, but got none; make them with {again}"
-            )
-        try:
-            rows.append(read_run(path))
-        except UNREADABLE as error:
-            raise ValueError(
-                f"{path}: expected a measured run, but got {unreadable(error)}; measure it with {again}"
-            ) from error
-    choices = (
-        [row["metrics"].get("protocol", {}).get("method", path.name) for row, path in zip(rows, paths)],
-        [path.resolve().name for path in paths],
-        [path.as_posix() for path in paths],
-        [f"{number} {path.as_posix()}" for number, path in enumerate(paths, 1)],
-    )
-    return dict(zip(next(names for names in choices if len(set(names)) == len(names)), rows))

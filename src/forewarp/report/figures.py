@@ -64,8 +64,7 @@ def draw_own(folder: Path) -> None:
     """
     if points := read_points(folder):
         try:
-            figure, axes = _curves([(points, {"color": "C0", "linewidth": 2})])
-            axes[0].set_title(folder.name)
+            figure, _ = _curves([(points, {"color": "C0", "linewidth": 2})], folder.name)
             print(f"curve    {save(figure, folder / 'accuracy_time.png')}")
         except ImportError as error:
             print(f"without accuracy_time.png: {error}")
@@ -87,13 +86,12 @@ def draw_scene(path: Path, groups: Mapping[tuple, Sequence[Row]], title: str, pu
     styles = {key: {"color": f"C{i % 10}", "linestyle": dashes[i >= 10]} for i, key in enumerate(keys)}
     grey = {"color": "0.8", "zorder": 1}
     lines = [(row["points"], styles.get(key, grey)) for key, group in groups.items() for row in group]
-    figure, axes = _curves(lines, [other.seconds for other in published])
+    figure, axis = _curves(lines, title, [other.seconds for other in published])
     for (variant, minutes), style in styles.items():
-        axes[0].plot([], [], label=f"{variant}, {minutes:g} min" if minutes else variant, **style)
+        axis.plot([], [], label=f"{variant}, {minutes:g} min" if minutes else variant, **style)
     marks = [point.seconds for _, point in front], [point.psnr for _, point in front]
-    axes[0].plot(*marks, "ko", markersize=4, label="Pareto front")
-    _stars(axes[0], published, 0)
-    axes[0].set_title(title)
+    axis.plot(*marks, "ko", markersize=4, label="Pareto front")
+    _stars(axis, published, 0)
     return save(figure, path)
 
 
@@ -110,8 +108,10 @@ def pareto_front(points: Sequence[tuple[float, float]]) -> list[int]:
     return front
 
 
-def _curves(lines: Sequence[tuple[Sequence[Point], dict]], seconds: Sequence[float] = ()):
-    """Draw curves, each with its style: PSNR, and below it the flow error if it is known."""
+def _curves(lines: Sequence[tuple[Sequence[Point], dict]], title: str, seconds: Sequence[float] = ()):
+    """Draw curves, each with its style: PSNR, and below it the flow error if it is known; return the figure
+    and the axis of PSNR.
+    """
     seconds = [*seconds, *(point.seconds for points, _ in lines for point in points)]
     with_flow = any(point.epe is not None for points, _ in lines for point in points)
     figure, axes = figure_of(1 + with_flow, 1, (7, 7.5 if with_flow else 4.5))
@@ -122,7 +122,8 @@ def _curves(lines: Sequence[tuple[Sequence[Point], dict]], seconds: Sequence[flo
         axes[0, 0].plot([p.seconds for p in points], [p.psnr for p in points], **style)
         if with_flow and (known := [p for p in points if p.epe is not None]):
             axes[1, 0].plot([p.seconds for p in known], [p.epe for p in known], **style)
-    return figure, axes[:, 0]
+    axes[0, 0].set_title(title)
+    return figure, axes[0, 0]
 
 
 def _stars(axis, published: Sequence, first: int) -> None:
@@ -193,16 +194,10 @@ def draw_curves(path: Path, rows: Mapping[str, Row], title: str) -> Path | None:
     low, high = axis.get_ylim()
     places = spread_out([points[-1][1] for points in curves.values()], 0.042 * (high - low))
     for (name, points), place in zip(curves.items(), places):
-        axis.annotate(
-            f"{points[-1][1]:.1f}  {name}",
-            points[-1],
-            (1.03, place),
-            textcoords=axis.get_yaxis_transform(),
-            color=styles[name][0],
-            verticalalignment="center",
-            annotation_clip=False,
-            arrowprops={"color": styles[name][0]} | LEADER,
-        )
+        last, color = points[-1], styles[name][0]
+        about = {"color": color, "verticalalignment": "center", "annotation_clip": False}
+        about |= {"textcoords": axis.get_yaxis_transform(), "arrowprops": {"color": color} | LEADER}
+        axis.annotate(f"{last[1]:.1f}  {name}", last, (1.03, place), **about)
     axis.set_title(title)
     return save(figure, path)
 

@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import product
+from itertools import chain, product
 from pathlib import Path
 from statistics import fmean
 from typing import NamedTuple
@@ -22,13 +22,12 @@ from forewarp.metrics.gain import Estimate, pooled_deviation
 from forewarp.metrics.registry import metric_of
 from forewarp.report import figures
 from forewarp.report.choices import every_run
-from forewarp.report.results import COUNTERPART, KINDS, Point, Row, Runs, portable, read_runs
+from forewarp.report.results import KINDS, Point, Row, Runs, grouped, portable, read_runs
 from forewarp.report.tables import Cell, Column, Difference, Section, Table, rendered
 
 PAPER = Path(__file__).with_name("paper.yaml")  # the printed numbers
 # What the runs of one row of a table have in common.
-BUDGET = ("preset", "minutes", "iterations", "held_out", "train_views")
-BUDGET += ("device", "threads", "clock", "tested")
+BUDGET = "preset", "minutes", "iterations", "held_out", "train_views", "device", "threads", "clock", "tested"
 ROW = ("ablation", "method", *BUDGET)
 UNPRINTED = ("particles", "backward")  # methods of this project that the paper prints no row of
 METHODS = ("particles", "forward", "backward")  # that are compared in pictures
@@ -133,11 +132,6 @@ def _table(key: str, entry: dict, datasets: dict) -> PaperTable:
     return PaperTable(*of_table, entry["notes"], means)
 
 
-def dataset_of(run: Row) -> str:
-    """Return the dataset of a run's scene, also of a counterpart's."""
-    return run["dataset"].removeprefix(COUNTERPART)
-
-
 def measured(table: PaperTable, runs: Runs, variants: Sequence[str] = ()) -> list[Runs]:
     """Return the runs of each measured row: by variant, then as printed, then ``UNPRINTED``, then others.
 
@@ -154,7 +148,7 @@ def measured(table: PaperTable, runs: Runs, variants: Sequence[str] = ()) -> lis
         by_method = methods.index(run["method"]) if run["method"] in methods else len(methods)
         return variants.index(run["ablation"] or "plain"), by_method, *(str(run[name] or "") for name in ROW)
 
-    fitting = (r for r in runs if (r["ablation"] or "plain") in variants and dataset_of(r) in datasets)
+    fitting = (run for run in runs.where(origin=datasets) if (run["ablation"] or "plain") in variants)
     return sorted(Runs(fitting).by(*ROW).values(), key=place)
 
 
@@ -164,9 +158,9 @@ def by_seed(runs: Runs, group: Group, metric: str) -> dict[int, float]:
     Empty if there is no such seed, or the scenes' images differ in size or background.
     """
     scores, conditions = {}, set()
-    for run in runs:
+    for run in runs.where(origin=group.dataset, scene=group.scenes):
         of_run = run["test"].get(group.ability or run["ability"], {})
-        if dataset_of(run) == group.dataset and run["scene"] in group.scenes and metric in of_run:
+        if metric in of_run:
             scores[run["scene"], run["seed"]] = of_run[metric] * (100 if metric in DEPTH else 1)
             protocol = run["metrics"].get("protocol", {})
             conditions.add(tuple(protocol.get(key) for key in ("half_resolution", "scale", "background")))
@@ -177,7 +171,7 @@ def by_seed(runs: Runs, group: Group, metric: str) -> dict[int, float]:
 
 def cells_of(runs: Runs, table: PaperTable) -> list[Estimate | None]:
     """Estimate every column's mean over the seeds of ``by_seed``; None where these are none."""
-    return [Estimate.of(list(by_seed(runs, *column).values())) for column in table.columns]
+    return [Estimate.of(by_seed(runs, *column).values()) for column in table.columns]
 
 
 def numbered(runs: Iterable[Row]) -> dict[str, int]:
@@ -205,7 +199,11 @@ def comparison(table: PaperTable, runs: Runs, numbers: Mapping[str, int] | None 
         numbers: of the page's protocols, as of ``numbered``; None: those of ``runs`` alone.
     """
     found = measured(table, runs)
-    table = of_datasets(table, {dataset_of(run) for of_row in found for run in of_row})
+    datasets = {run["origin"] for of_row in found for run in of_row}
+    kept = [i for i, (group, _) in enumerate(table.columns) if group.dataset in datasets]
+    rows = [row._replace(values=tuple(row.values[i] for i in kept)) for row in table.rows]
+    groups = [group for group in table.groups if group.dataset in datasets]
+    table = replace(table, groups=groups, rows=rows)
     numbers, no_costs = numbers or numbered(runs), [None] * len(COSTS)
     lines, rules = [], []
     for printed in [*table.rows, None]:
@@ -233,28 +231,18 @@ def stand_in(table: PaperTable, runs: Runs, numbers: Mapping[str, int] | None = 
     made, found = counterpart(table, runs), measured(table, runs)
     if made is None or not found:
         return None
-    numbers, datasets = numbers or numbered(runs), {dataset_of(run) for of_row in found for run in of_row}
-    shown = [
-        (number, group)
-        for number, (group, metric) in enumerate(table.columns)
-        if metric == "psnr" and group.dataset in datasets and len(group.scenes) > 1
-    ]
+    numbers, datasets = numbers or numbered(runs), {run["origin"] for of_row in found for run in of_row}
+    scores = [(i, group) for i, (group, metric) in enumerate(table.columns) if metric == "psnr"]
+    shown = [(i, group) for i, group in scores if group.dataset in datasets and len(group.scenes) > 1]
     lines = []
     for of_row in found:
-        printed, own = table.printed(of_row[0]), {dataset_of(run) for run in of_row}
+        printed, own = table.printed(of_row[0]), {run["origin"] for run in of_row}
         values = [printed.values[i] if printed and group.dataset in own else "" for i, group in shown]
         beside = [printed.name if printed else "", *values]
         lines.append([name_of(of_row, found), *cells_of(of_row, made), *costs_of(of_row, numbers), *beside])
     columns = ["measured", *(_column(*column) for column in made.columns), *COSTS, "published as"]
     columns += [f"published: {group.name} PSNR" for _, group in shown]
     return Table(columns, lines, marks=_marks(found, made, lines, 1)).filled()
-
-
-def of_datasets(table: PaperTable, datasets: Collection[str]) -> PaperTable:
-    """Leave out the columns of other datasets."""
-    kept = [i for i, (group, _) in enumerate(table.columns) if group.dataset in datasets]
-    rows = [row._replace(values=tuple(row.values[i] for i in kept)) for row in table.rows]
-    return replace(table, groups=[group for group in table.groups if group.dataset in datasets], rows=rows)
 
 
 def counterpart(table: PaperTable, runs: Runs) -> PaperTable | None:
@@ -264,7 +252,7 @@ def counterpart(table: PaperTable, runs: Runs) -> PaperTable | None:
     """
     groups = {}
     for group in table.groups if not table.means else ():
-        for scene in sorted({run["scene"] for run in runs if dataset_of(run) == group.dataset}):
+        for scene in runs.where(origin=group.dataset).by("scene"):
             name = group.name if group.ability else scene
             groups[scene, group.ability, group.metrics] = group._replace(name=name, scenes=(scene,))
     return replace(table, groups=list(groups.values()), rows=[], means={}) if groups else None
@@ -305,15 +293,10 @@ def name_of(runs: Runs, among: Sequence[Runs]) -> str:
 
 def _conditions(runs: Runs) -> list[str]:
     run, seeds = runs[0], len(runs.by("seed"))
-    parts = [run["preset"]]
-    if run["minutes"]:
-        parts.append(f"{run['minutes']:g} min" + " of processor time" * (run["clock"] == "processor"))
-    parts += [f"{run['iterations']} steps"] if run["iterations"] else []
-    parts += [f"{seeds} seeds"] if seeds > 1 else []
-    parts += [f"{run['held_out']} views held out"] if run["held_out"] else []
-    parts += [f"{run['train_views']} training views"] if run["train_views"] else []
-    views = run["tested"]
-    return parts + ([f"{views} test view{'s' * (views != 1)}"] if views else [])
+    more = {"seeds": seeds if seeds > 1 else 0, "views held out": run["held_out"]}
+    more |= {"training views": run["train_views"], f"test view{'s' * (run['tested'] != 1)}": run["tested"]}
+    numbers = [f"{number} {words}" for words, number in more.items() if number]
+    return budget_of(run, by_processor=" of processor time") + numbers
 
 
 def _column(group: Group, metric: str) -> Column:
@@ -354,17 +337,14 @@ def write_paper(folder: Path, out: Path, published: Path = PAPER, curves: Path |
     elsewhere = [
         f"{dataset or 'no dataset'}, {len(found)} run{'s' * (len(found) > 1)}: "
         "not in any table of the paper; use kind=compare or kind=accuracy_time"
-        for dataset, found in Runs(run | {"of": dataset_of(run)} for run in runs).by("of").items()
+        for dataset, found in runs.by("origin").items()
         if dataset not in {group.dataset for table in paper for group in table.groups}
     ]
     for line in elsewhere:
         print(line)
     left_out += elsewhere
     real, made = runs.where(counterpart=False), runs.where(counterpart=True)
-    shown_runs = {
-        table: [Runs(run for row in measured(table, kind) for run in row) for kind in (real, made)]
-        for table in paper
-    }
+    shown_runs = {table: [Runs(chain(*measured(table, kind))) for kind in (real, made)] for table in paper}
     used = Runs(run for kinds in shown_runs.values() for kind in kinds for run in kind)
     numbers, tables, files = numbered(used), [], []
     for table, (of_real, of_made) in shown_runs.items():
@@ -399,7 +379,7 @@ def _read(folder: Path, tables: Iterable[PaperTable]) -> tuple[Runs, list[str]]:
     runs, left_out = read_runs(folder)
     open_kind = {group.dataset for table in tables for group in table.groups if group.ability is None}
     for run in runs:
-        if dataset_of(run) in open_kind and run["ability"] != "all":
+        if run["origin"] in open_kind and run["ability"] != "all":
             run["protocol"] += f", scores of test views {KINDS.get(run['ability'], run['ability'])}"
     runs, older = runs.newest("dataset", "scene", "seed", *ROW)
     return runs, left_out + [f"{row['folder']}: another run of the same is newer" for row in older]
@@ -407,10 +387,7 @@ def _read(folder: Path, tables: Iterable[PaperTable]) -> tuple[Runs, list[str]]:
 
 def _about(tables: Iterable[Section], runs: Runs, numbers: Mapping[str, int]) -> Section:
     """Gather what a page tells once: how the runs were made, and each footnote with its tables."""
-    notes: dict[str, list[str]] = {}
-    for section in tables:
-        for note in section.notes:
-            notes.setdefault(note, []).append(section.title.partition(":")[0])
+    notes = grouped((note, section.title.partition(":")[0]) for section in tables for note in section.notes)
     lines = [f"{', '.join(dict.fromkeys(titles))}: {note}" for note, titles in notes.items()]
     return Section("How they were measured", facts=[*facts(runs, numbers), *lines])
 
@@ -419,12 +396,7 @@ def facts(runs: Runs, numbers: Mapping[str, int]) -> list[str]:
     """State protocols by their numbers on the page, machine, budget, date and a command of the runs."""
     if not runs:
         return ["measured: nothing yet"]
-    budgets = set()
-    for run in runs:
-        minutes = f"{run['minutes']:g} min a run" if run["minutes"] else ""
-        minutes += " by the processor clock" if minutes and run["clock"] == "processor" else ""
-        steps = f"{run['iterations']} steps" if run["iterations"] else ""
-        budgets.add(", ".join(filter(None, (run["preset"], minutes, steps))))
+    budgets = {", ".join(budget_of(run, " a run", " by the processor clock")) for run in runs}
     protocols = sorted((numbers[text], text) for text in runs.by("protocol"))
     count = len({run["folder"] for run in runs})
     return [
@@ -436,16 +408,19 @@ def facts(runs: Runs, numbers: Mapping[str, int]) -> list[str]:
     ]
 
 
+def budget_of(run: Row, each: str = "", by_processor: str = "") -> list[str]:
+    """Name a run's preset, and the minutes and steps that bound it."""
+    clock = by_processor if run["clock"] == "processor" else ""
+    minutes = [f"{run['minutes']:g} min{each}{clock}"] if run["minutes"] else []
+    return [run["preset"], *minutes, *([f"{run['iterations']} steps"] if run["iterations"] else [])]
+
+
 def _figures(runs: Runs, out: Path, curves: Path | None) -> list[Section]:
     """Draw what these runs allow, and add the pictures in ``curves``; say if matplotlib is missing."""
-    sections, plain = [], runs.where(ablation=None)
-
-    def add(title: str, path: Path | None) -> None:
-        sections.extend([Section(title, pictures=[path])] if path is not None else [])
-
+    plain = runs.where(ablation=None)
     try:
         sizes = Runs(run for run in runs if str(run["ablation"]).startswith("resolution "))
-        add("Resolution", figures.draw_resolution(out / "paper-resolution.png", sizes))
+        drawn = {"Resolution": figures.draw_resolution(out / "paper-resolution.png", sizes)}
         for scene, of_scene in plain.by("scene").items():
             rivals = {}  # the last of several budgets or seeds
             for same in of_scene.by("seed", *BUDGET).values():
@@ -454,23 +429,23 @@ def _figures(runs: Runs, out: Path, curves: Path | None) -> list[Section]:
                 rivals = own if len(own) > 1 else rivals
             if rivals:
                 first = next(iter(rivals.values()))
-                usual = 0.5 if dataset_of(first) == "hypernerf" else 0.0
+                usual = 0.5 if first["origin"] == "hypernerf" else 0.0
                 at = first["metrics"]["protocol"].get("canonical_time", usual)
-                words = f"{scene}, near the canonical time"
-                drawn = figures.draw_beside(out / f"paper-canonical-{scene}.png", rivals, at, words)
-                add(f"Canonical comparison: {scene}", drawn)
+                picture, words = out / f"paper-canonical-{scene}.png", f"{scene}, near the canonical time"
+                drawn[f"Canonical comparison: {scene}"] = figures.draw_beside(picture, rivals, at, words)
         for dataset, method in product(DATASETS, METHODS[:2]):
-            scenes = {run["scene"]: run for run in plain.where(method=method) if dataset_of(run) == dataset}
-            drawn = figures.draw_sheet(out / f"paper-views-{dataset}-{method}.png", scenes)
-            add(f"Views: {dataset}, {method}", drawn)
+            scenes = {run["scene"]: run for run in plain.where(method=method, origin=dataset)}
+            picture = out / f"paper-views-{dataset}-{method}.png"
+            drawn[f"Views: {dataset}, {method}"] = figures.draw_sheet(picture, scenes)
     except ImportError as error:
         return [Section("Figures", facts=[str(error)])]
+    sections = [Section(title, pictures=[path]) for title, path in drawn.items() if path is not None]
     for path in sorted(curves.glob("accuracy-time-*.png")) if curves is not None else ():
         if path.parent.resolve() != out.resolve():
             replace_file(out / path.name, path.read_bytes())
-    if drawn := sorted(out.glob("accuracy-time-*.png")):
+    if pictures := sorted(out.glob("accuracy-time-*.png")):
         lines = ["separate runs, with views held out: forewarp-report kind=accuracy_time"]
-        sections.append(Section("Accuracy against training time", facts=lines, pictures=drawn))
+        sections.append(Section("Accuracy against training time", facts=lines, pictures=pictures))
     return sections
 
 
@@ -493,7 +468,7 @@ def write_ablation(folder: Path, out: Path, published: Path = PAPER) -> list[Pat
     tables = [table for table in paper if not table.means and len(table.parts) > 1]
     known = {row.variant for table in tables for row in table.parts}
     rest = Runs(r for r in runs.where(preset=AT_REST) if r["ablation"] in known or r["method"] == "backward")
-    runs = Runs(run for run in runs if run["ablation"] in known and run["preset"] != AT_REST)
+    runs = Runs(run for run in runs.where(ablation=known) if run["preset"] != AT_REST)
     if not runs and not rest:
         raise ValueError(f"{folder}: expected runs of ablations, but got none; make some with make ablations")
     page, files = out / "ablation.md", [out / "ablation.md"]
@@ -515,13 +490,11 @@ def _page(tables: Sequence[PaperTable], runs: Runs, left_out: Sequence[str]) -> 
     numbers = numbered(runs)
     orders: dict[str, list[str]] = {}  # of each budget, what became of the paper's order in each row
     sections = [section for table in tables for section in _ablated(table, runs, orders, numbers)]
-    lines = [
-        [budget, len(found), *(sum(order.startswith(kind) for order in found) for kind in ORDERS)]
-        for budget, found in orders.items()
-    ]
+    counts = {b: [sum(o.startswith(kind) for o in found) for kind in ORDERS] for b, found in orders.items()}
+    lines = [[budget, len(orders[budget]), *count] for budget, count in counts.items()]
     columns = ["budget of a run", *(Column(kind, 0) for kind in ("rows", *ORDERS))]
     caption = "Rows of all tables below, by what became of the paper's order:"
-    used = Runs(run for run in runs if any(run["ablation"] in table.variants for table in tables))
+    used = runs.where(ablation={variant for table in tables for variant in table.variants})
     about = _about(sections, used, numbers)
     sections = [Section("In short", [Table(columns, lines, caption)]), *sections, about] if runs else []
     sections += [Section("Left out", facts=left_out)] if left_out else []
@@ -548,10 +521,10 @@ def _at_rest(tables: Sequence[PaperTable], runs: Runs) -> dict:
                 if scores:
                     change = Estimate.of(change) if variant != "full" else None
                     order = verdict(change.mean, printed.get(variant), noise) if change else None
-                    late = Estimate.of([g for run in of_row if (g := late_gain(run["points"])) is not None])
-                    line = [scene, name, printed.get(variant), Estimate.of(list(scores.values())), change]
+                    late = Estimate.of(late_gain(run["points"]) for run in of_row)
+                    line = [scene, name, printed.get(variant), Estimate.of(scores.values()), change, order]
                     took = of_row.mean("train")
-                    line += [order, of_row.estimate("psnr_canonical"), late]
+                    line += [of_row.estimate("psnr_canonical"), late]
                     lines.append([*line, of_row.mean("steps"), took and took / 60])
     return {"table": Table(columns, lines), "noise": "; ".join(noises), "facts": facts(runs, numbered(runs))}
 
@@ -572,8 +545,7 @@ def _groups(table: PaperTable, runs: Runs) -> Iterator[tuple[Group, Runs, bool]]
         of_kind = runs.where(counterpart=made)
         shown = counterpart(table, of_kind) if made else table
         for group in shown.groups if shown else ():
-            own = Runs(run for run in of_kind if run["scene"] in group.scenes)
-            own = Runs(run for run in own if dataset_of(run) == group.dataset)
+            own = of_kind.where(scene=group.scenes, origin=group.dataset)
             if scenes := tuple(scene for scene in group.scenes if own.where(scene=scene)):
                 yield group._replace(scenes=scenes), own, made
 
@@ -590,7 +562,7 @@ def _ablated(
             title = f"{table.title}: {group.name}"
             title += f", of which {', '.join(group.scenes)}" if not made and group.scenes != whole else ""
             title += f", {group.scenes[0]}" if made and group.name != group.scenes[0] else ""
-            used = Runs(run for run in own if run["ablation"] in table.variants)
+            used = own.where(ablation=set(table.variants))
             sections.append(Section(title, [changes], facts(used, numbers), table.notes))
     return sections
 
@@ -640,7 +612,7 @@ def _changes(table: PaperTable, group: Group, runs: Runs, orders: dict[str, list
                 orders.setdefault(label, []).append(order)
             step, of_whole = found[row.variant].mean("step"), found["full"].mean("step")
             times = step / of_whole if step and of_whole else None
-            line += [Estimate.of(list(psnr[row.variant].values())), change, order, step, times]
+            line += [Estimate.of(psnr[row.variant].values()), change, order, step, times]
     kept = [line for line in lines if any(cell is not None for cell in line[2:])]
     return Table(columns, kept, "; ".join(captions) + ".")
 
@@ -672,8 +644,7 @@ def _printed_changes(table: PaperTable, group: Group) -> dict[str, float]:
 
 def _label(run: Row, others: Sequence[Row]) -> str:
     """Name a run's budget, with what else tells it from the others."""
-    parts = [f"{run['minutes']:g} min"] if run["minutes"] else []
-    parts += [f"{run['iterations']} steps"] if run["iterations"] else []
+    parts = budget_of(run)[1:]
     for name in ("preset", "device", "threads", "clock", "tested", "held_out", "train_views"):
         several = len({other[name] for other in others}) > 1
         parts += [f"{name.replace('_', ' ').replace('tested', 'views')} {run[name]}"] if several else []

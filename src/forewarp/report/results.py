@@ -12,7 +12,8 @@ import io
 import math
 import re
 import statistics
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from datetime import datetime, timezone
 from itertools import chain
 from pathlib import Path
@@ -41,18 +42,8 @@ CONDITIONS = {
 }
 KEY = ("method", "preset", "scene", "minutes", "seed", *CONDITIONS)
 SCORES = ("psnr", "ssim", "lpips")  # that a table has, whether measured or not
-NUMBERS = (
-    "steps",
-    "step",
-    "frame",
-    "parameters",
-    "memory",
-    "ends",
-    "motion_error",
-    "psnr_space",
-    "psnr_time",
-)
-NUMBERS += ("psnr_canonical", "size", "wall", "processor")
+NUMBERS = ("steps", "step", "frame", "parameters", "memory", "ends", "motion_error")
+NUMBERS += ("psnr_space", "psnr_time", "psnr_canonical", "size", "wall", "processor")
 TEXTS = ("dataset", "day", "commit", "departures", "faults", "views", "curve", "command")
 # Kinds of test view, and parts of their pixels, that scores are of.
 KINDS = {"space": "at training times", "time": "between training times", "canonical": "at the canonical time"}
@@ -64,34 +55,16 @@ KINDS |= {
 }
 COUNTERPART = "counterpart of "  # begins the dataset of synthetic scenes that stand in for its own
 NETS = ("vgg", "alex", "squeeze")  # LPIPS in tables is of the first whose weights were there
-PROTOCOL = (
-    "half_resolution",
-    "scale",
-    "split",
-    "frames",
-    "views",
-    "train_frames",
-    "train_views",
-    "test_views",
-    "test_cameras",
-    "test_moments",
-    "test_frames",
-)
-PROTOCOL += (
-    "window",
-    "measured",
-    "held_out",
-    "canonical_time",
-    "mask_box",
-    "exposure",
-)  # what pages tell of a run's protocol
+# What pages tell of a run's protocol.
+PROTOCOL = ("half_resolution", "scale", "split", "frames", "views", "train_frames", "train_views")
+PROTOCOL += ("test_views", "test_cameras", "test_moments", "test_frames", "window", "measured", "held_out")
+PROTOCOL += ("canonical_time", "mask_box", "exposure")
 OWN = "run|sheets|paths.runs|paths.data"  # keys that say where a run's files are, not what it is
 # What stands for the folders of whoever types a command again.
 PLACES = {"paths.scenes": "DATASETS", "data.root": "SCENES", "lpips_weights": "WEIGHTS"}
 UNREADABLE = OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError, yaml.YAMLError
 _ENDS = 0.1  # share of the time that counts as its first and last part
 _EARLY, _LATE = 0.95, 1.5  # of its minutes: less was ended by steps, more had a last step that took long
-_MOST = 1 << 24  # bytes of a table that is read back
 
 
 class Point(NamedTuple):
@@ -110,8 +83,9 @@ class Runs(list[Row]):
     """Rows, to select, group and average."""
 
     def where(self, **equal: object) -> Runs:
-        """Select the rows that have these values."""
-        return Runs(row for row in self if all(row[name] == value for name, value in equal.items()))
+        """Select the rows that have these values; of a set or a tuple, one of its values."""
+        wanted = {n: value if isinstance(value, set | tuple) else (value,) for n, value in equal.items()}
+        return Runs(row for row in self if all(row[name] in values for name, values in wanted.items()))
 
     def by(self, *names: str) -> dict:
         """Group rows that are equal in ``names``, in the order of these: the value, or the values -> Runs."""
@@ -129,7 +103,7 @@ class Runs(list[Row]):
 
     def estimate(self, name: str) -> Estimate | None:
         """Estimate a number over the rows that have it; None if none has."""
-        return Estimate.of([row[name] for row in self if row.get(name) is not None])
+        return Estimate.of(row.get(name) for row in self)
 
     def mean(self, name: str) -> float | None:
         """Average a number over the rows that have it; None if none has."""
@@ -144,6 +118,11 @@ class Runs(list[Row]):
         """
         estimates = {name: self.estimate(name) for name in (*self.scores(), *NUMBERS, "epe")}
         return self[0] | {"seeds": len(self)} | estimates | more
+
+    def paired(self, others: Runs) -> list[tuple[Row, Row]]:
+        """Pair the rows with those of ``others`` of the same seed."""
+        of_seed = {row["seed"]: row for row in others}
+        return [(row, of_seed[row["seed"]]) for row in self if row["seed"] in of_seed]
 
     def scores(self) -> list[str]:
         """List the metrics of the rows in the order of tables: ``SCORES``, then those that were added."""
@@ -201,13 +180,21 @@ class Runs(list[Row]):
                 commands.append(overrides(typed))
         words = dict.fromkeys(chain(*commands))
         shared = [word for word in words if all(word in command for command in commands)]
-        varied: dict[str, list[str]] = {}
-        for word in words:
-            if word not in shared:
-                key, _, value = word.partition("=")
-                varied.setdefault(key, []).append(value)
+        varied = grouped(word.partition("=")[::2] for word in words if word not in shared)
         listed = [f"`{key}={','.join(values)}`" for key, values in varied.items()]
         return {"shared": " ".join(shared), "varied": listed} if commands else None
+
+
+def grouped(pairs: Iterable[tuple]) -> dict[object, list]:
+    """Gather the values of pairs by their keys.
+
+    >>> grouped([("a", 1), ("b", 2), ("a", 3)])
+    {'a': [1, 3], 'b': [2]}
+    """
+    values: dict[object, list] = {}
+    for key, value in pairs:
+        values.setdefault(key, []).append(value)
+    return values
 
 
 def read_runs(root: Path, needed: Sequence[str] = ("metrics.json",)) -> tuple[Runs, list[str]]:
@@ -232,8 +219,8 @@ def read_runs(root: Path, needed: Sequence[str] = ("metrics.json",)) -> tuple[Ru
         absent = [name for name in needed if not (folder / name).is_file()]
         try:
             row = read_run(folder)
-        except UNREADABLE as error:
-            left_out.append(f"{folder.relative_to(root)}: cannot be read ({unreadable(error)})")
+        except ValueError as error:
+            left_out.append(f"{folder.relative_to(root)}: cannot be read ({error})")
             continue
         if row["config"].get("debug"):
             debugging += 1
@@ -246,9 +233,8 @@ def read_runs(root: Path, needed: Sequence[str] = ("metrics.json",)) -> tuple[Ru
             runs.append(row)
     left_out += [f"left out: debug runs: {debugging}"] if debugging else []
     if not runs and not left_out:
-        raise ValueError(
-            f"{root}: expected folders of runs, but got none; make some with forewarp-train, or set runs=..."
-        )
+        do = "make some with forewarp-train, or set runs=..."
+        raise ValueError(f"{root}: expected folders of runs, but got none; {do}")
     # In names that are typed overrides, drop the overrides that all such runs of a scene share.
     for of_scene in runs.where(typed=True).by("scene").values():
         names = [overrides(row["ablation"]) for row in of_scene]
@@ -259,11 +245,17 @@ def read_runs(root: Path, needed: Sequence[str] = ("metrics.json",)) -> tuple[Ru
     return runs, left_out
 
 
-def unreadable(error: Exception) -> str:
-    """Say in a few words why a run cannot be read."""
-    return f"no key {error}" if isinstance(error, KeyError) else str(error).split("\n")[0]
+@contextmanager
+def refused(before: str = "", after: str = "") -> Iterator[None]:
+    """Say in one line, as a ValueError, what is wrong with a run's files; with words around it."""
+    try:
+        yield
+    except UNREADABLE as error:
+        why = f"no key {error}" if isinstance(error, KeyError) else str(error).split("\n")[0]
+        raise ValueError(f"{before}{why}{after}") from error
 
 
+@refused()
 def read_run(folder: Path) -> Row:
     """Read a run's folder; files that are missing are empty.
 
@@ -275,7 +267,8 @@ def read_run(folder: Path) -> Row:
     * ``variant``: that name, else method and preset; ``about`` it; ``against``: the variant to compare with;
     * ``ability``: the kind of test view that scores are of: ``all``, else ``time`` (between training times),
       else the first; ``test``: the scores of every kind; ``tested``: number of views scored, None: all;
-    * ``train`` (seconds), ``epe`` (world units), ``torch``, ``counterpart``, ``effects``, ``protocol``.
+    * ``train`` (seconds), ``epe`` (world units), ``torch``, ``effects``, ``protocol``;
+    * ``counterpart``: whether the scene is synthetic; ``origin``: its dataset without ``COUNTERPART``.
     """
     config = yaml.safe_load(read_text(folder / "config.yaml", MOST_CONFIG))
     stages = {file.parent.name: load_json(file) for file in sorted(folder.glob("*/done.json"))}
@@ -307,12 +300,13 @@ def read_run(folder: Path) -> Row:
     row |= {"scene": str(config["data"]["scene"]), "seed": int(config["seed"])}
     row |= {"minutes": budget["minutes"], "iterations": budget.get("iterations")}
     row |= {"clock": protocol.get("clock") or budget.get("clock") or "wall"}
-    row |= {name: protocol.get(name) for name in ("threads", "device", "commit", "departures", "faults")}
+    told = ("threads", "device", "commit", "departures", "faults", "train_views")
+    row |= {name: protocol.get(name) for name in told}
     row |= {"torch": protocol.get("versions", {}).get("torch"), "held_out": protocol.get("held_out") or None}
     row |= {"measured": protocol.get("measured", f"all {frames} test views" if frames else None)}
-    row |= {"train_views": protocol.get("train_views")}
     row |= {"tested": int(tested) if tested.isdigit() else None}  # as of "10 of 30 test views, evenly spread"
     row |= {"counterpart": synthetic, "dataset": COUNTERPART * stands_in + dataset}
+    row["origin"] = dataset.removeprefix(COUNTERPART)
     row |= {"day": datetime.fromtimestamp(measured_at / 1e9, timezone.utc).date().isoformat()}
     row |= {"effects": ", ".join(name for name, on in (metrics.get("effects") or {}).items() if on)}
     row |= {"curve": " ".join(f"{point.seconds:.1f}:{point.psnr:.2f}" for point in points)}
@@ -346,6 +340,30 @@ def read_run(folder: Path) -> Row:
     shown = {n: score for n, score in scores.items() if metric_of(n).summary and not n.startswith("lpips_")}
     scores = dict.fromkeys(SCORES) | shown | {"lpips": nets[0] if nets else None}
     return row | scores | {"scores": scores}
+
+
+def read_compared(folders: Sequence[str | Path]) -> dict[str, Row]:
+    """Read runs, named by their methods if these differ, else by as much of their folders as needed.
+
+    Raises:
+        ValueError: if there is no folder, or one that holds no measured run.
+    """
+    if not folders:
+        raise ValueError("runs: expected folders of runs, but got none; set runs=[FOLDER,FOLDER]")
+    rows, paths = [], [Path(folder) for folder in folders]
+    for path in paths:
+        again, numbers = f"forewarp-evaluate run={path}", path / "metrics.json"
+        if not numbers.is_file():
+            raise ValueError(f"{numbers}: expected a run's numbers, but got none; make them with {again}")
+        with refused(f"{path}: expected a measured run, but got ", f"; measure it with {again}"):
+            rows.append(read_run(path))
+    choices = (
+        [row["metrics"].get("protocol", {}).get("method", path.name) for row, path in zip(rows, paths)],
+        [path.resolve().name for path in paths],
+        [path.as_posix() for path in paths],
+        [f"{number} {path.as_posix()}" for number, path in enumerate(paths, 1)],
+    )
+    return dict(zip(next(names for names in choices if len(set(names)) == len(names)), rows))
 
 
 def read_points(folder: Path) -> tuple[Point, ...]:
@@ -405,15 +423,12 @@ def add_to_table(file: Path, rows: Iterable[Row]) -> Runs:
     Raises:
         ValueError: if there would be no row.
     """
-    known = (
-        [_read(row) for row in csv.DictReader(io.StringIO(read_text(file, _MOST)))] if file.is_file() else []
-    )
+    known = [_read(row) for row in read_rows(file)]
     rows = [row | {"command": portable(row["command"])} for row in rows]
     known += sorted(rows, key=lambda row: row["measured_at"])
     if not known:
-        raise ValueError(
-            "runs: expected measured runs that ended after minutes, but got none; set budget.minutes"
-        )
+        expected = "measured runs that ended after minutes, but got none; set budget.minutes"
+        raise ValueError(f"runs: expected {expected}")
     last = {key_of(row, KEY): row for row in sorted(known, key=lambda row: row["day"] or "")}
     runs = Runs(last[key] for key in sorted(last, key=_order))
     text, fields = io.StringIO(), (*KEY, *runs.scores(), *NUMBERS, *TEXTS)

@@ -21,8 +21,8 @@ from forewarp.metrics.registry import metric_of
 from forewarp.progress import time_text
 from forewarp.report.choices import seconds_to
 from forewarp.report.figures import sheets_of, thirds
-from forewarp.report.results import KINDS, UNREADABLE, Row, read_run, unreadable
-from forewarp.report.tables import TEMPLATES, Column, Table, rendered
+from forewarp.report.results import KINDS, Row, read_run, refused
+from forewarp.report.tables import TEMPLATES, Column, Table, rendered, score_columns
 
 if TYPE_CHECKING:  # so that what is refused waits for no torch
     from torch import Tensor
@@ -91,19 +91,15 @@ def read_story(folder: Path) -> Row:
     Raises:
         ValueError: in one line, if the folder holds no run, several runs, or one that cannot be read.
     """
-    if not (folder / "config.yaml").is_file():
+    if not (config := folder / "config.yaml").is_file():
         runs = sorted(path.parent for depth in ("*", "*/*") for path in folder.glob(f"{depth}/config.yaml"))
-        if runs:
-            some = ", ".join(str(run) for run in runs[:3]) + (", ..." if len(runs) > 3 else "")
-            raise ValueError(
-                f"run: expected the folder of one run, but got {folder}, which holds {len(runs)}; "
-                f"choose one: {some}"
-            )
-        raise ValueError(
-            f"{folder / 'config.yaml'}: expected the configuration of a run, but got none; "
-            "set run=<a run's folder>"
-        )
-    try:
+        if not runs:
+            expected = "the configuration of a run, but got none; set run=<a run's folder>"
+            raise ValueError(f"{config}: expected {expected}")
+        some = ", ".join(map(str, runs[:3])) + ", ..." * (len(runs) > 3)
+        got = f"{folder}, which holds {len(runs)}; choose one: {some}"
+        raise ValueError(f"run: expected the folder of one run, but got {got}")
+    with refused(f"run: expected a run whose files can be read, but got {folder} (", ")"):
         row = read_run(folder)
         planned = row["config"].get("stage") or row["stages"]
         stages = [name for name, stage in planned.items() if stage is not None]
@@ -114,10 +110,6 @@ def read_story(folder: Path) -> Row:
         row["loss"] = _read_losses(row, stages)
         sizes = row["metrics"].get("size") or {}
         row["consists"] = next((of for of in sizes.items() if of[0] in ("particles", "voxels")), None)
-    except UNREADABLE as error:
-        raise ValueError(
-            f"run: expected a run whose files can be read, but got {folder} ({unreadable(error)})"
-        ) from error
     return row
 
 
@@ -131,8 +123,8 @@ def _read_losses(row: Row, stages: Sequence[str]) -> dict[str, list[tuple[float,
         loss = [(step - first, value) for step, value in logged if first < step <= last]
         first = last
         # The known moments of a stage: its step -> seconds of training over all stages.
-        known = {0: before}
-        known |= {int(m["step"]): float(m["seconds"]) for m in moments if m.get("stage") == stage}
+        known = {int(m["step"]): float(m["seconds"]) for m in moments if m.get("stage") == stage}
+        known.setdefault(0, before)
         if done is not None:
             before += float(done["seconds"])
             known[int(done["steps"])] = before
@@ -245,17 +237,12 @@ def room_of(row: Row, media: Media, megabytes: float) -> float:
         ValueError: in one line, if the text alone is larger, or the run's files hold what no page can show.
     """
     views = [dict.fromkeys([*shown.pictures, "thumb"], "") for shown in media.views]
-    try:
+    with refused(f"run: expected a run whose files can be shown, but got {row['folder']} (", ")"):
         bare = len(page(row, media, views, "data:" if media.video else "").encode()) + NOTES
-    except UNREADABLE as error:
-        raise ValueError(
-            f"run: expected a run whose files can be shown, but got {row['folder']} ({unreadable(error)})"
-        ) from error
     room = 1e6 * megabytes - bare
     if room < 0:
-        raise ValueError(
-            f"megabytes: expected room for the page's text, {bare / 1e6:.2f}, but got {megabytes}; raise it"
-        )
+        expected = f"room for the page's text, {bare / 1e6:.2f}"
+        raise ValueError(f"megabytes: expected {expected}, but got {megabytes}; raise it")
     return room
 
 
@@ -319,8 +306,7 @@ def page(
 
 def _score_table(rows: Sequence[dict], heads: Mapping[str, Column | str]) -> Table:
     """Make a table of rows with ``scores``, and what they begin with."""
-    names = list(dict.fromkeys(name for row in rows for name in row["scores"]))
-    columns = {name: Column(metric_of(name).heading, metric_of(name).digits) for name in names}
+    columns = score_columns(dict.fromkeys(name for row in rows for name in row["scores"]), with_unit=True)
     return Table.of([row["scores"] | row for row in rows], {**heads, **columns})
 
 
@@ -338,9 +324,8 @@ def _effects(row: Row) -> list[dict]:
         words = row["command"].split()
     typed = {word.split("=")[0].lstrip("+~"): word for word in words if "=" in word}
     chosen = [typed[key] for key in ("ablation", "experiment", "scene", "preset") if key in typed]
-    default = f"As model={row['method']} has it" + (
-        f" with {' '.join(chosen)}." if chosen else " by default."
-    )
+    of = f"with {' '.join(chosen)}" if chosen else "by default"
+    default = f"As model={row['method']} has it {of}."
     effects = []
     for name in dict.fromkeys([*planned, *switched]):
         decision = planned.get(name)
@@ -441,8 +426,7 @@ def _of_views(images: Sequence[dict]) -> list[dict]:
         told = "{name}, time {time:.3f}: {psnr:.2f} dB"
         return [(i + 1, images[i], told.format(**images[i])) for i in kept]
 
-    kinds = list(dict.fromkeys(image["ability"] for image in images))
-    series = []
+    kinds, series = list(dict.fromkeys(image["ability"] for image in images)), []
     for kind in kinds:
         points = [(v["time"], v["psnr"], told) for _, v, told in drawn(by_time) if v["ability"] == kind]
         series.append((KINDS.get(kind, kind) if len(kinds) > 1 else "", "dots", points))
@@ -450,18 +434,12 @@ def _of_views(images: Sequence[dict]) -> list[dict]:
     count, below = len(stems[2]), sum(image["psnr"] < mean - 1 for image in images)
     fewer = f" {count} of the {len(images)} views are drawn; the words are of all." * (count < len(images))
     lowest = f"The lowest, {low['psnr']:.1f} dB, is {low['name']} at time {low['time']:.2f}."
-    ranks = (
-        f"From the worst view ({low['psnr']:.1f} dB) to the best ({high['psnr']:.1f} dB), from their mean; "
-        f"{below} of {len(images)} {'is' if below == 1 else 'are'} more than 1 dB below it.{fewer}"
-    )
+    dots = f"A dot is a test view. {lowest}{fewer}"
+    worst, best = f"{low['psnr']:.1f} dB", f"{high['psnr']:.1f} dB"
+    ranks = f"From the worst view ({worst}) to the best ({best}), from their mean; {below} of {len(images)} "
+    ranks += f"{'is' if below == 1 else 'are'} more than 1 dB below it.{fewer}"
     return [
-        chart(
-            "Through the scene's time",
-            f"A dot is a test view. {lowest}{fewer}",
-            series,
-            ("time in the scene", "PSNR (dB)"),
-            mean=mean,
-        ),
+        chart("Through the scene's time", dots, series, ("time in the scene", "PSNR (dB)"), mean=mean),
         chart("View by view", ranks, [stems], ("view, from worst to best", "PSNR (dB)"), mean=mean),
     ]
 

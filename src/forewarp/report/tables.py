@@ -17,6 +17,7 @@ from tabulate import tabulate
 
 from forewarp.metrics.gain import Estimate
 from forewarp.metrics.registry import metric_of
+from forewarp.report.results import NETS
 
 TEMPLATES = Path(__file__).with_name("templates")
 MARKS = {
@@ -144,13 +145,12 @@ class Table:
             form: one of ``MARKS``; "": no marks.
             escape: function applied to the text of each cell first.
         """
-        return [
-            [
-                MARKS[form].get(self.marks.get((i, j)), "{}").format(escape(self.columns[j].text(value)))
-                for j, value in enumerate(row)
-            ]
-            for i, row in enumerate(self.rows)
-        ]
+
+        def marked(i: int, j: int, text: str) -> str:
+            return MARKS[form].get(self.marks.get((i, j)), "{}").format(escape(text))
+
+        texts = [map(Column.text, self.columns, row) for row in self.rows]
+        return [[marked(i, j, text) for j, text in enumerate(row)] for i, row in enumerate(texts)]
 
     def csv(self) -> str:
         """Return all digits as CSV; the standard deviation of an estimate has a column of its own."""
@@ -166,9 +166,10 @@ class Table:
         return file.getvalue()
 
 
-def score_columns(names: Iterable[str]) -> dict[str, Column]:
-    """Make a column for each metric."""
-    return {name: Column(metric_of(name).title, metric_of(name).digits) for name in names}
+def score_columns(names: Iterable[str], *, with_unit: bool = False) -> dict[str, Column]:
+    """Make a column for each metric, named by its title, or by its heading, which has the unit."""
+    metrics = {name: metric_of(name) for name in names}
+    return {n: Column(m.heading if with_unit else m.title, m.digits) for n, m in metrics.items()}
 
 
 _TAG = re.compile(r"<(?!/?u>)(?=[A-Za-z/!?])")  # a run's names and notes may hold any; ours underline
@@ -193,14 +194,10 @@ def rendered(template: str, **values: object) -> str:
 
 @cache
 def _environment() -> Environment:
-    environment = Environment(
-        autoescape=lambda name: name.endswith(".html.j2"),
-        loader=FileSystemLoader(TEMPLATES),
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-        keep_trailing_newline=True,
-    )
+    blocks = dict.fromkeys(("trim_blocks", "lstrip_blocks", "keep_trailing_newline"), True)
+    environment = Environment(loader=FileSystemLoader(TEMPLATES), undefined=StrictUndefined, **blocks)
+    environment.autoescape = lambda name: name.endswith(".html.j2")
+    environment.globals["nets"] = NETS
     environment.filters |= {
         "tex": latex_text,
         "tex_head": _latex_head,
