@@ -154,7 +154,8 @@ class VoxelGrid(nn.Module):
     """Parameters (N, C) with one row per active voxel, and buffers with the voxels' positions.
 
     ``voxels`` (N, 3) are the active voxels' lattice positions, ``index`` (X, Y, Z) their rows or -1. Both
-    change during training (``activate``, ``resample``), so loading adopts a checkpoint's lattice and shapes.
+    change during training (``activate``, ``resample``), so a method that loads adopts a checkpoint's lattice
+    and shapes, those of ``grows``.
 
     Args:
         lattice: possible voxel positions.
@@ -162,10 +163,13 @@ class VoxelGrid(nn.Module):
         channels: number of channels C by parameter name.
     """
 
+    loose = ("index",)
+
     def __init__(self, lattice: Lattice, active: Tensor, channels: dict[str, int]) -> None:
         super().__init__()
         self.lattice = lattice
         self.names = tuple(channels)
+        self.grows = ("voxels", "index", *channels)
         voxels = active.nonzero()
         self.register_buffer("voxels", voxels)
         self.register_buffer("index", index_of(voxels, lattice.shape))
@@ -262,42 +266,16 @@ class VoxelGrid(nn.Module):
         try:
             lattice = _lattice(state[prefix + "_extra_state"])
         except (KeyError, TypeError, ValueError, OverflowError):
-            return "_extra_state"
-        voxels, index = (state.get(prefix + name) for name in ("voxels", "index"))
-        if not _is(voxels, torch.int64) or voxels.ndim != 2 or voxels.shape[1] != 3:
-            return "voxels"
+            return f"{prefix}_extra_state"
+        voxels, index = (state[prefix + name] for name in ("voxels", "index"))
         if not bool(lattice.holds(voxels).all()):
-            return "voxels"
-        if (
-            not _is(index, torch.int32) or tuple(index.shape) != lattice.shape
-        ):  # before one is made of a shape
-            return "index"
-        if not torch.equal(index, index_of(voxels, lattice.shape)):
-            return "index"
-        for name in self.names:
-            values, own = state.get(prefix + name), self.parameter(name)
-            good = torch.is_tensor(values) and values.is_floating_point()
-            if not good or tuple(values.shape) != (len(voxels), own.shape[1]):
-                return name
-        return None
-
-    def _load_from_state_dict(self, state_dict, prefix, *args, **kwargs) -> None:
-        for name in ("voxels", "index"):
-            if prefix + name in state_dict:
-                setattr(self, name, torch.empty_like(state_dict[prefix + name]))
-        for name in self.names:
-            if prefix + name in state_dict:
-                p = self.parameter(name)
-                p.data = p.data.new_empty(state_dict[prefix + name].shape)
-        super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
+            return f"{prefix}voxels"
+        fits = index.shape == lattice.shape  # before one is made of a shape
+        return None if fits and torch.equal(index, index_of(voxels, lattice.shape)) else f"{prefix}index"
 
 
 def _lattice(state: dict) -> Lattice:
     return Lattice(Box(tuple(state["low"]), tuple(state["high"])), tuple(state["shape"]))
-
-
-def _is(value: object, dtype: torch.dtype) -> bool:
-    return torch.is_tensor(value) and value.dtype == dtype
 
 
 def density_shift(alpha_init: float, key: str = "model.radiance.alpha_init") -> float:

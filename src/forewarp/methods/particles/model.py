@@ -76,6 +76,7 @@ class Particles(Method):
     terms = ("photo", *IMAGE_LOSSES, "depth", "rigid", "smooth", "static")
     numbers = tuple(key for key in Numbers.__dataclass_fields__ if key != "name")
     asks = Asks(kind="pictures", straight=True)
+    loose = Skinning.ROWS  # a particle follows fewer nodes where there are few
     effects, still_steps = EFFECTS, 700  # a step is of one image
     on_cpu = "its kernels are the CPU's"
 
@@ -223,26 +224,14 @@ class Particles(Method):
         """See ``Method``."""
         return "particles", len(self.means)
 
-    def adopted(self) -> set[str]:
-        """See ``Method``: nodes too are as many as a checkpoint says."""
-        nodes = () if self.nodes is None else self.nodes.rows()
-        return {*self.grows, *(f"nodes.{name}" for name in nodes)}
-
     def misfit(self, state: Mapping[str, Tensor]) -> str | None:
-        """See ``Method``; what is stored of nodes must go together, too."""
-        if self.nodes is None:
-            return super().misfit(state)
-        if len({state[name].shape for name in Skinning.ROWS}) > 1:
-            return Skinning.ROWS[0]
-        if misfit := self.nodes.misfit(state, "nodes."):
+        """See ``Method``; what is stored of the skinning must go together with all nodes, too."""
+        misfit = super().misfit(state)
+        if misfit or self.nodes is None:
             return misfit
-        if not are_rows(state["skinning.links"], len(state["nodes.positions"])):
-            return "skinning.links"
-        width = self.skinning.links.shape[1]  # a particle follows fewer nodes where there are few
-        links = {
-            name: state[name][:, :1].expand(-1, width) for name in Skinning.ROWS if state[name].dim() == 2
-        }
-        return super().misfit({**state, **links})
+        links, *others = (state[name] for name in self.loose)
+        fits = len(links) == len(state["means"]) and all(links.shape == other.shape for other in others)
+        return None if fits and are_rows(links, len(state["nodes.positions"])) else self.loose[0]
 
     def at(self, moment: Moment) -> Snapshot:
         """Move every particle; nothing is rendered yet."""

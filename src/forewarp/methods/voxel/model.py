@@ -17,6 +17,7 @@ from forewarp.fields.grids import (
     FieldAtTime,
     RadianceGrid,
     Shade,
+    VoxelGrid,
     mean_color,
     shaded,
 )
@@ -193,9 +194,10 @@ class VoxelMethod(Method):
         """Take over what the stage before has learned, or start with faint matter; prepare the loss terms."""
         before = _carried(start, self.stage)
         if before is not None:
-            grids = self._grids()
-            for place, grid in before._grids().items():  # F2's features; those of voxels are resampled by now
-                if place in grids and grid.lattice != grids[place].lattice:
+            grids = dict(self.named_modules())
+            for place, grid in before.named_modules():
+                # F2's features; those of voxels are resampled by now.
+                if place in grids and isinstance(grid, VoxelGrid) and grid.lattice != grids[place].lattice:
                     empty = dict.fromkeys(grid.names, 0.0)
                     grid.resample(grids[place].lattice, grids[place].index >= 0, empty)
             for key in self.grids.keys() - before.grids.keys():  # a background that only this stage has
