@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from forewarp.fields.grids import VoxelGrid
 from forewarp.fields.networks import mlp
+from forewarp.ops.backend import check_value
 from forewarp.ops.curves import dct_basis, spline_basis, spline_shares
 from forewarp.ops.encode import positional_encoding
 from forewarp.ops.grid import corner_weights, index_of, trilinear
@@ -17,6 +18,11 @@ from forewarp.scene.box import Box, Lattice
 
 KINDS = ("spline", "cosines")
 PADDING = 0.2  # of the sequence, imagined before and after it: a cosine stands still at both ends
+
+
+def _check_times(count: int) -> None:
+    wanted = "at least 2 distinct training times"
+    check_value("model.motion", count, wanted, lambda count: count >= 2, "choose model/motion=none")
 
 
 class Curve:
@@ -40,13 +46,8 @@ class Curve:
     def __init__(
         self, kind: str, count: int, times: int, canonical_time: float, *, straight: bool = False
     ) -> None:
-        if kind not in KINDS:
-            raise ValueError(f"model.motion: expected {', '.join(KINDS)} or none, but got {kind!r}")
-        if times < 2:
-            raise ValueError(
-                f"model.motion: expected at least 2 distinct training times, but got {times}; "
-                "use model.motion=none"
-            )
+        check_value("model.motion", kind, f"{', '.join(KINDS)} or none", KINDS.__contains__)
+        _check_times(times)
         self.kind, self.times, self.canonical_time = kind, times, canonical_time
         self.straight = straight and kind == "spline"
         if kind == "cosines":
@@ -129,11 +130,7 @@ class TrajectoryField(nn.Module):
         padding: float = 0.0,
     ) -> None:
         super().__init__()
-        if frames < 2:
-            raise ValueError(
-                f"model.motion: expected at least 2 distinct training times, but got {frames}; "
-                "use model/motion=none"
-            )
+        _check_times(frames)
         self.box, self.frames, self.canonical_time = box, frames, canonical_time
         self.bases = min(bases, frames - 1)
         self.scale = 0.5 * max(box.size)

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from forewarp.fields.networks import mlp
+from forewarp.ops.backend import check_value, is_number
 from forewarp.ops.encode import encoded_size, positional_encoding
 from forewarp.ops.grid import index_of, occupied_cells, trilinear
 from forewarp.scene.box import Box, Lattice
@@ -65,11 +66,8 @@ class Activation:
     density_scale: float
 
     def __post_init__(self) -> None:
-        if not 0 < self.density_scale < float("inf"):
-            raise ValueError(
-                f"density_scale: expected a length > 0 from the stage before, but got {self.density_scale}; "
-                "delete the folder of that stage"
-            )
+        wanted, anew = "a length > 0 from the stage before", "delete the folder of that stage"
+        check_value("density_scale", self.density_scale, wanted, lambda scale: 0 < scale < math.inf, anew)
 
     def sigma(self, raw: Tensor) -> Tensor:
         """Return the density per world unit of length, in the shape of ``raw``."""
@@ -287,8 +285,7 @@ def density_shift(alpha_init: float, key: str = "model.radiance.alpha_init") -> 
     >>> round(density_shift(0.5), 6)
     0.0
     """
-    if not isinstance(alpha_init, int | float) or not 0 < alpha_init < 1:
-        raise ValueError(f"{key}: expected a number in (0, 1), but got {alpha_init}")
+    check_value(key, alpha_init, "a number in (0, 1)", lambda alpha: is_number(alpha) and 0 < alpha < 1)
     return math.log(1 / (1 - alpha_init) - 1)
 
 
@@ -456,10 +453,9 @@ def _indices(grid: VoxelGrid, strides: tuple[int, ...], padded: bool) -> tuple[T
     known = getattr(grid, "_strided", None)
     if known is None or known[0] is not grid.index or known[1] != (strides, padded):
         missing = [(1 - n) % strides[-1] for n in grid.index.shape]
-        if any(missing) and not padded:
-            raise ValueError(
-                f"a strided grid: expected sizes of {strides[-1]} k + 1, but got {tuple(grid.index.shape)}"
-            )
+        if not padded:
+            wanted, shape = f"sizes of {strides[-1]} k + 1", tuple(grid.index.shape)
+            check_value("a strided grid", shape, wanted, lambda _: not any(missing))
         ends = [end for more in reversed(missing) for end in (0, more)]
         index = torch.nn.functional.pad(grid.index, ends, value=-1)
         known = grid.index, (strides, padded), (index, [index[::s, ::s, ::s].contiguous() for s in strides])

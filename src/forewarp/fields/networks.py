@@ -11,6 +11,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from forewarp.ops.backend import check_value
 from forewarp.ops.encode import encoded_size, positional_encoding
 from forewarp.ops.gaussians import rotations
 from forewarp.ops.nodes import geman_mcclure, move_by_screw, stretch
@@ -135,9 +136,8 @@ class Template(nn.Module):
     ) -> None:
         super().__init__()
         if condition < 1 or width < 2:
-            raise ValueError(
-                f"template: expected condition >= 1 and width >= 2, but got {condition=}, {width=}"
-            )
+            wanted = "condition >= 1 and width >= 2"
+            raise ValueError(f"template: expected {wanted}, but got {condition=}, {width=}")
         self.trunk = Trunk(inputs, width=width, layers=layers, skip=skip)
         self.density_head = nn.Linear(width, 1)
         self.bottleneck = nn.Linear(width, width)
@@ -339,11 +339,9 @@ class PictureEncoder(nn.Module):
     ) -> None:
         super().__init__()
         by = 2 ** len(tower)
-        if len(size) != 2 or min(size) < by or any(side % by for side in size):
-            raise ValueError(
-                f"model.picture_size: expected height and width in multiples of {by}, as the tower halves "
-                f"{len(tower)} times, but got {list(size)}"
-            )
+        wanted = f"height and width in multiples of {by}, as the tower halves {len(tower)} times"
+        good = len(size) == 2 and min(size) >= by and not any(side % by for side in size)
+        check_value("model.picture_size", list(size), wanted, lambda _: good)
         steps = list(zip((3, *tower[:-1]), tower))
         self.towers = nn.ModuleList(
             nn.Sequential(

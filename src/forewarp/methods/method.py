@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from forewarp.fields.moving import MovingGaussians
-from forewarp.ops.backend import is_number
+from forewarp.ops.backend import check_value, is_number
 from forewarp.scene.box import Box, Lattice
 from forewarp.scene.cloud import Cloud, Ellipsoids, Handover
 from forewarp.scene.frame import Frame, Scene
@@ -377,8 +377,7 @@ def check_number(key: str, given: Any, wanted: str, good: Callable[[float], bool
     Raises:
         ValueError: naming the key, and in words what it takes.
     """
-    if not is_number(given) or not good(given):
-        raise ValueError(f"{key}: expected {wanted}, but got {given!r}")
+    check_value(key, given, wanted, lambda value: is_number(value) and good(value))
 
 
 def check_least(least: int = 0, *, of: str = "model", **given: Any) -> None:
@@ -388,19 +387,17 @@ def check_least(least: int = 0, *, of: str = "model", **given: Any) -> None:
         ValueError: naming the key.
     """
     for name, count in given.items():
-        if isinstance(count, bool) or not isinstance(count, int) or count < least:
-            raise ValueError(f"{of}.{name}: expected a whole number >= {least}, but got {count}")
+        wanted = f"a whole number >= {least}"
+        check_value(f"{of}.{name}", count, wanted, lambda number: type(number) is int and number >= least)
 
 
-def check_pair(key: str, given: Any) -> None:
-    """Refuse what is not two whole numbers >= 1.
+def check_effects(key: str, given: Sequence[str], names: Sequence[str]) -> None:
+    """Refuse effects of a stage, ``stage.<name>.effects``, that are not among ``names``.
 
     Raises:
         ValueError: naming the key.
     """
-    pair = isinstance(given, list | tuple) and len(given) == 2
-    if not pair or not all(type(number) is int and number >= 1 for number in given):
-        raise ValueError(f"{key}: expected two whole numbers >= 1, but got {given}")
+    check_value(key, list(given), f"some of {', '.join(names)}", set(names).issuperset)
 
 
 def steps_of(
@@ -425,9 +422,8 @@ def steps_of(
     good = pairs and all(0 <= begin <= 1 and count >= least for begin, count in pairs)
     if not good or fractions != sorted(fractions) or (from_start and fractions[0] != 0):
         form = "[[0, count], [fraction, count], ...]" if from_start else "[[fraction, count], ...]"
-        raise ValueError(
-            f"{key}: expected {form} with ascending fractions and counts >= {least:g}, but got {given}"
-        )
+        wanted = f"{form} with ascending fractions and counts >= {least:g}"
+        raise ValueError(f"{key}: expected {wanted}, but got {given}")
     return pairs
 
 

@@ -15,8 +15,9 @@ from forewarp import losses
 from forewarp.fields.grids import VoxelGrid, density_shift
 from forewarp.fields.networks import mlp
 from forewarp.fields.occupancy import Occupancy
-from forewarp.methods.method import Start, check_least, check_number, check_pair, those_that_hold
+from forewarp.methods.method import Start, check_least, check_number, those_that_hold
 from forewarp.methods.rays import JUMP, NO_JUMP, MarchedMethod, Marching, regrow, whole_grid
+from forewarp.ops.backend import check_value
 from forewarp.ops.encode import encoded_size, positional_encoding
 from forewarp.ops.grid import dilate, second_variation, trilinear
 from forewarp.scene.box import Box, Lattice
@@ -98,8 +99,8 @@ class NDVG(MarchedMethod):
         box = start.handover.box if tight else start.scene.box
         where = f"stage.{start.stage}"
         super().__init__(start, marching, box, f"{where}.alpha_init")
-        check_pair("model.width", width)
-        check_pair("model.channels", channels)
+        for key, pair in (("width", width), ("channels", channels)):
+            check_value(f"model.{key}", pair, "two whole numbers >= 1", _is_pair)
         check_least(frequencies=frequencies, direction_frequencies=direction_frequencies)
         given = {f.name: start.numbers[f.name] for f in fields(NDVGStage) if f.name in start.numbers}
         self.stage = NDVGStage(**given).checked(where)
@@ -293,6 +294,11 @@ def _read(grid: VoxelGrid, name: str, points: Tensor) -> Tensor:
     """Read a parameter (N, C) of a dense grid at world points (P, 3): (P, C)."""
     values = grid.parameter(name)
     return trilinear(values, grid.index, grid.lattice.to_lattice(points), values.new_zeros(values.shape[1]))
+
+
+def _is_pair(given: object) -> bool:
+    is_two = isinstance(given, list | tuple) and len(given) == 2
+    return is_two and all(type(number) is int and number >= 1 for number in given)
 
 
 def _some(times: Sequence[float]) -> list[float]:

@@ -278,10 +278,8 @@ def shots_of(scene: Scene, wanted: int | None) -> list[list[Frame]]:
     fixed = sorted(set.intersection(*({frame.camera_id for frame in frames} for frames in by_time)) - {None})
     there = max(len(fixed), 1)
     if wanted is not None and not 1 <= wanted <= there:
-        raise ValueError(
-            f"model.pictures: expected at most {there}, as so many cameras took training pictures at every "
-            f"instant, but got {wanted}; set model.pictures=null"
-        )
+        why = f"as so many cameras took training pictures at every instant, but got {wanted}"
+        raise ValueError(f"model.pictures: expected at most {there}, {why}; set model.pictures=null")
     if not fixed:
         return [frames[:1] for frames in by_time]
     chosen = [fixed[i] for i in spread(len(fixed), min(wanted or _MOST, there))]

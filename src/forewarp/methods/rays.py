@@ -25,6 +25,7 @@ from forewarp.methods.method import (
     those_that_hold,
 )
 from forewarp.methods.rows import RowsAdam, renew_parameters
+from forewarp.ops.backend import check_value
 from forewarp.ops.encode import encoded_size, positional_encoding
 from forewarp.ops.march import warm_up
 from forewarp.renderer import Marched, Quadrature, Renderer, Sampled, in_chunks
@@ -174,8 +175,8 @@ class Sampling:
     def __post_init__(self) -> None:
         check_number("model.sampling.hull", self.hull, *FRACTION)
         check_least(of="model.sampling", occupancy=self.occupancy)
-        if self.density not in ("relu", "softplus"):
-            raise ValueError(f"model.sampling.density: expected relu or softplus, but got {self.density!r}")
+        known = ("relu", "softplus")
+        check_value("model.sampling.density", self.density, " or ".join(known), known.__contains__)
 
     def departures(self, density: str, jitters: bool) -> list[str]:
         """List what differs from a publication's density, and whether it ``jitters`` samples in images."""

@@ -13,10 +13,11 @@ from torch import Tensor, nn
 from forewarp.fields.curves import Curve
 from forewarp.fields.moving import GaussiansSnapshot, cosines, pinhole_of
 from forewarp.losses import IMAGE_LOSSES, robust
-from forewarp.methods.method import Method, Snapshot, Start, Step, value_at
-from forewarp.methods.particles import density, exposure, queries
+from forewarp.methods.method import Snapshot, Start, Step, value_at
+from forewarp.methods.particles import density, exposure
 from forewarp.methods.particles.nodes import Nodes, Skinning, TimeOffsets, are_rows
 from forewarp.methods.particles.options import EFFECTS, SMALLEST, Effects, Numbers, view_share
+from forewarp.methods.particles.queries import Queries
 from forewarp.methods.particles.shared import begin_window, check_still, left_alone
 from forewarp.methods.particles.start import (
     at_rest,
@@ -27,14 +28,7 @@ from forewarp.methods.particles.start import (
     widths,
 )
 from forewarp.methods.rows import RowsAdam
-from forewarp.ops.gaussians import (
-    BLUR,
-    CHUNK,
-    DEEP,
-    Gaussians,
-    Warp,
-    compare,
-)
+from forewarp.ops.gaussians import BLUR, CHUNK, DEEP, Gaussians, Warp, compare
 from forewarp.ops.nodes import pull_nodes
 from forewarp.scene.cloud import Cloud
 from forewarp.scene.view import Asks, Batch, Moment, Observation
@@ -58,7 +52,7 @@ class ParticlesSnapshot(GaussiansSnapshot, Snapshot):
         return moment.time == self.moment.time and lit[0] == lit[1]
 
 
-class Particles(Method):
+class Particles(Queries):
     """N canonical Gaussians, and M nodes that carry them through time.
 
     A step renders a whole image, compares it, and has its gradients in one pass of ``ops.compare``; the
@@ -79,12 +73,6 @@ class Particles(Method):
     loose = Skinning.ROWS  # a particle follows fewer nodes where there are few
     effects, still_steps = EFFECTS, 700  # a step is of one image
     on_cpu = "its kernels are the CPU's"
-
-    # Scene queries: see ``methods.method``.
-    matter, bounds, trajectories = queries.matter, queries.bounds, queries.trajectories
-    ellipsoids, template, movement = queries.ellipsoids, queries.template, queries.movement
-    moving, in_motion, only, common = queries.moving, queries.in_motion, queries.only, queries.common
-    carried = queries.carried
 
     def __init__(
         self,
@@ -243,12 +231,10 @@ class Particles(Method):
         """Return the particles, in a ``light`` or their own, as the operators read them: coefficients of one
         kind in one tensor.
         """
-        opacity = [self.opacity] if self.opacity_over_time is None else [self.opacity, self.opacity_over_time]
-        opacity = opacity[0] if len(opacity) == 1 else torch.cat(opacity, -1)
-        colors = [getattr(self, name) for name in self._color_parameters()]
-        colors = colors[0] if len(colors) == 1 else torch.cat(colors, 1)
+        opacities = [part for part in (self.opacity, self.opacity_over_time) if part is not None]
+        colors = self._joined([getattr(self, name) for name in self._color_parameters()])
         colors = colors if light is None else exposure.lit(colors, light)
-        return Gaussians(self.means, self.scales, self.quaternions, opacity, colors)
+        return Gaussians(self.means, self.scales, self.quaternions, self._joined(opacities), colors)
 
     def light(self, moment: Moment) -> Tensor | None:
         """Return the gain and the bias (2, 3) of the colours of an image that a camera of the training images
@@ -260,6 +246,10 @@ class Particles(Method):
 
     def _drift(self, time: float) -> list[float]:
         return exposure.basis_at(len(self.exposure), time, self.shared is not None)
+
+    @staticmethod
+    def _joined(kinds: list[Tensor]) -> Tensor:
+        return kinds[0] if len(kinds) == 1 else torch.cat(kinds, 1)
 
     def _color_parameters(self) -> list[str]:
         """Return the parameters of colour that there are, in the operators' order."""
@@ -274,21 +264,9 @@ class Particles(Method):
 
     def time_bases(self, time: float) -> tuple[Tensor, Tensor]:
         """Return what a time makes of the coefficients of colour (T,) and of opacity (1 + F,)."""
-        color = [] if self.color_over_time is None else self.color_basis(time)
-        opacity = [] if self.opacity_over_time is None else self.opacity_basis(time)
+        counts = (0 if p is None else p.shape[1] for p in (self.color_over_time, self.opacity_over_time))
+        color, opacity = (cosines(count, time, self.canonical_time) for count in counts)
         return self.means.new_tensor(color), self.means.new_tensor([1.0, *opacity])
-
-    def color_basis(self, time: float) -> list[float]:
-        """Return the cosines of colour over time."""
-        return self._cosines(self.color_over_time.shape[1], time)
-
-    def opacity_basis(self, time: float) -> list[float]:
-        """Return the cosines of opacity over time."""
-        return self._cosines(self.opacity_over_time.shape[1], time)
-
-    def _cosines(self, count: int, time: float) -> list[float]:
-        """Return ``cos(pi k t) - cos(pi k t_c)`` for k = 1 .. count: 0 at the canonical time."""
-        return cosines(count, time, self.canonical_time)
 
     @torch.no_grad()
     def look(self, batch: Batch, factors: Mapping[str, float], generator: torch.Generator) -> Step:
@@ -471,9 +449,8 @@ class Particles(Method):
 
     def departures(self) -> list[str]:
         """See ``Method``."""
-        return [
-            "from the forward-flow paper: particles that are rasterised, not voxels that rays march through"
-        ]
+        note = "particles that are rasterised, not voxels that rays march through"
+        return [f"from the forward-flow paper: {note}"]
 
 
 def _coefficients(before: Tensor | None, *shape: int) -> nn.Parameter | None:

@@ -149,12 +149,9 @@ class Nodes(nn.Module):
 
     def param_groups(self) -> dict[str, list[nn.Parameter]]:
         """Return what is learned, by the name of its learning rate."""
-        groups = {"node_translations": [self.translations]}
-        if self.rotations is not None:
-            groups["node_rotations"] = [self.rotations]
-        if self.time_offsets is not None:
-            groups["time_offsets"] = [self.time_offsets.values]
-        return groups
+        groups = {"node_translations": [self.translations], "node_rotations": self._coefficients()[1:]}
+        groups["time_offsets"] = [] if self.time_offsets is None else [self.time_offsets.values]
+        return {name: group for name, group in groups.items() if group}
 
     def _coefficients(self) -> list[nn.Parameter]:
         return [self.translations] if self.rotations is None else [self.translations, self.rotations]
@@ -238,9 +235,8 @@ class Nodes(nn.Module):
             the mean of the squared second differences, and gradients by the parameters' names.
         """
         bend = self._second_difference(motion_time) if factor else torch.zeros_like(basis)
-        *gradients, bent = spread_nodes(
-            self.translations, self.rotations, by_motion, basis, bend, factor, unit
-        )
+        coefficients = self.translations, self.rotations
+        *gradients, bent = spread_nodes(*coefficients, by_motion, basis, bend, factor, unit)
         if self.stopped is not None and bool(self.stopped.any()):
             for gradient in gradients:
                 if gradient is not None:

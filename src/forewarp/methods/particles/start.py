@@ -116,25 +116,20 @@ def hull_surface(scene: Scene, frames: list[int], count: int) -> Cloud | None:
     fine = Lattice.of_count(box, min(_FINE, 2 * side) ** 3)
     voxels = fine.all_voxels()
     # Only what the rough hull, a voxel wider, allows is looked at again.
-    allowed = _grown(inside.reshape(rough.shape))
+    allowed = dilate(inside.reshape(rough.shape))
     at = rough.to_lattice(fine.to_world(voxels)).round().long()
     at = torch.minimum(at.clamp(min=0), torch.tensor(rough.shape) - 1)
     maybe = allowed[at.unbind(-1)]
     solid = torch.zeros(len(voxels), dtype=torch.bool)
     solid[maybe] = visual_hull(fine.to_world(voxels[maybe]), cameras, masks)
     solid = solid.reshape(fine.shape)
-    shell = (solid & _grown(~solid)).nonzero()
+    shell = (solid & dilate(~solid)).nonzero()
     if not len(shell):
         return None
     area = len(shell) * fine.voxel_size**2
     points = fine.to_world(shell[torch.randint(len(shell), (count,))] + torch.rand(count, 3) - 0.5)
     colors = seen_colors(points, cameras, images)
     return Cloud(points, colors, torch.full((count,), 0.5), (area / count) ** 0.5)
-
-
-def _grown(mask: Tensor) -> Tensor:
-    """Make a mask (X, Y, Z) one voxel wider on all sides; beyond its faces is nothing."""
-    return torch.nn.functional.max_pool3d(mask[None, None].float(), 3, 1, 1)[0, 0] > 0
 
 
 def at_rest(scene: Scene, points: Tensor) -> Tensor:
@@ -218,25 +213,26 @@ def measured(scene: Scene, count: int) -> Cloud | None:
     for i in (order[k] for k in spread(len(order), _MEASURED)):
         frame, camera = scene.train[i], scene.train[i].camera
         step = max(1, round((camera.width * camera.height / (_FIRST * count)) ** 0.5))
-        rows, columns = torch.meshgrid(
-            torch.arange(step // 2, camera.height, step),
-            torch.arange(step // 2, camera.width, step),
-            indexing="ij",
-        )
-        distance, trust = frame.load_sensed()[:, rows, columns].flatten(1)
+        rows, columns = _every(step, camera, step // 2, step // 2)
+        distance, trust = frame.load_sensed()[:, rows, columns]
         known = (distance > 0) & (trust >= _TRUSTED)
         if frame.load_valid is not None:
-            known &= frame.load_valid()[rows, columns].flatten()
-        rays = camera.rays((rows * camera.width + columns).flatten()[known])
-        new, distance = rays.origins + distance[known, None] * rays.directions, distance[known]
+            known &= frame.load_valid()[rows, columns]
+        rows, columns, distance = rows[known], columns[known], distance[known]
+        rays = camera.rays(rows * camera.width + columns)
+        new = rays.origins + distance[:, None] * rays.directions
         added = distance > (1 + _BEHIND) * _farthest(points, new, camera, step)
         points = torch.cat([points, new[added]])
-        colors = torch.cat(
-            [colors, frame.load()[rows, columns, :3].flatten(0, 1)[known][added].float() / 255]
-        )
+        colors = torch.cat([colors, frame.load()[rows[added], columns[added], :3].float() / 255])
         if math.isnan(size) and len(distance):
             size = float(distance.median()) * step / camera.fx
     return Cloud(points, colors, torch.full((len(points),), 0.5), size) if len(points) else None
+
+
+def _every(step: int, camera: Camera, top: int, left: int) -> tuple[Tensor, Tensor]:
+    """Return row and column (P,) of the pixels that are ``step`` apart, from the first one on."""
+    rows, columns = torch.arange(top, camera.height, step), torch.arange(left, camera.width, step)
+    return torch.cartesian_prod(rows, columns).unbind(-1)
 
 
 def _farthest(points: Tensor, new: Tensor, camera: Camera, step: int) -> Tensor:
@@ -383,12 +379,8 @@ def _holes(image: tuple[Tensor, Tensor, Camera], side: int, before: Tensor) -> t
     """
     rgb, valid, camera = image
     step = max(1, round(max(camera.width, camera.height) / side))
-    rows, columns = torch.meshgrid(
-        torch.arange(min(step // 2, camera.height - 1), camera.height, step),
-        torch.arange(min(step // 2, camera.width - 1), camera.width, step),
-        indexing="ij",
-    )
-    rows, columns = rows.flatten(), columns.flatten()
+    first = (min(step // 2, side - 1) for side in (camera.height, camera.width))
+    rows, columns = _every(step, camera, *first)
     rays = camera.rays(rows * camera.width + columns)
     is_hole = _in_holes(before, rays.origins + rays.directions, camera, side)
     is_hole &= valid[rows, columns]  # what is not learned from is no start either

@@ -13,6 +13,8 @@ from torch.utils.checkpoint import checkpoint
 from forewarp.fields.curves import TrajectoryField
 from forewarp.fields.grids import EMPTY, DirectRadiance, FieldAtTime, RadianceGrid, Shade, VoxelGrid
 from forewarp.fields.networks import mlp
+from forewarp.methods.method import FRACTION, check_least, check_number
+from forewarp.ops.backend import check_value
 from forewarp.ops.encode import encoded_size, positional_encoding, spherical_harmonics_1
 from forewarp.ops.grid import index_of, occupied_cells, trilinear
 from forewarp.ops.splat import average_splat, with_copies
@@ -35,11 +37,9 @@ class Motion(nn.Module):
         self, trajectory: TrajectoryField, *, tau: float = 1e-2, fade: float = 0.5, rest: float = 0.05
     ) -> None:
         super().__init__()
-        if not (0 < tau <= 1 and 0 <= fade <= 1 and 0 <= rest < 0.5):
-            raise ValueError(
-                "model.motion: expected 0 < tau <= 1, 0 <= fade <= 1 and 0 <= rest < 0.5, "
-                f"but got {tau=}, {fade=}, {rest=}"
-            )
+        check_number("model.motion.tau", tau, "a number in (0, 1]", lambda share: 0 < share <= 1)
+        check_number("model.motion.fade", fade, *FRACTION)
+        check_number("model.motion.rest", rest, "a number in [0, 0.5)", lambda voxels: 0 <= voxels < 0.5)
         self.trajectory, self.tau, self.fade, self.rest = trajectory, tau, fade, rest
 
     def flow(self, grid: VoxelGrid, time: float) -> Tensor:
@@ -197,11 +197,8 @@ class UNet3d(nn.Module):
         head: bool = True,
     ) -> None:
         super().__init__()
-        if width % 16 or levels < 2:
-            raise ValueError(
-                "model.inpainter: expected a width that is a multiple of 16 and levels >= 2, "
-                f"but got {width=}, {levels=}"
-            )
+        check_value("model.inpainter.width", width, "a multiple of 16", lambda number: number % 16 == 0)
+        check_least(2, of="model.inpainter", levels=levels)
         self.channels, self.width, self.margin = channels, width, margin
         self.coverage_channel = coverage_channel
         widths = [width * 2**level for level in range(levels)]
@@ -247,10 +244,8 @@ class TrilinearUpsampler(nn.Module):
 
     def __init__(self, *, scale: float = 2.0) -> None:
         super().__init__()
-        if not scale > 1:
-            raise ValueError(
-                f"model.upsampler.scale: expected a number > 1, but got {scale}; or model/upsampler=none"
-            )
+        none = "or choose model/upsampler=none"
+        check_value("model.upsampler.scale", scale, "a number > 1", lambda times: times > 1, none)
         self.scale = scale
 
     def forward(self, grid: RadianceGrid) -> RadianceGrid:
@@ -297,10 +292,8 @@ class LearnedUpsampler(TrilinearUpsampler):
         recompute: bool = True,
     ) -> None:
         super().__init__(scale=scale)
-        if int(scale) != scale:
-            raise ValueError(
-                f"model.upsampler.scale: the learned layer expects a whole number, but got {scale}"
-            )
+        wanted = "a whole number for the learned layer"
+        check_value("model.upsampler.scale", scale, wanted, lambda times: times == int(times))
         self.scale, self.margin, self.recompute = int(scale), margin, recompute
         self.project = Pointwise(features or channels, width)
         self.layers = nn.Sequential(ConvBlock(width, width), ConvBlock(width, width))

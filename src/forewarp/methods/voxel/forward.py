@@ -20,6 +20,7 @@ from forewarp.methods.voxel.effects import (
 )
 from forewarp.methods.voxel.model import Factory, VoxelMethod, VoxelSnapshot
 from forewarp.methods.voxel.structure import EFFECTS
+from forewarp.ops.backend import check_value
 from forewarp.scene.view import Moment
 
 
@@ -64,10 +65,8 @@ class ForwardWarp(VoxelMethod):
         self.motion = self.upsampler = self.inpainter = None
         self.moves = motion is not None and len(scene.times) > 1
         if self.moves:
-            if trajectory is None:
-                raise ValueError(
-                    "model.trajectory: expected a factory, but got null; choose another model/motion or model"
-                )
+            other = "choose another model/motion or model"
+            check_value("model.trajectory", trajectory, "a factory", callable, other)
             times = {"frames": len(scene.times), "canonical_time": scene.canonical_time}
             self.motion = motion(trajectory(scene.box, **times, voxels=self.radiance.lattice))
         inpainter = None if inpainter is None else inpainter(channels=channels, head=not learned)
@@ -75,12 +74,10 @@ class ForwardWarp(VoxelMethod):
             asked = {"channels": channels, "features": getattr(inpainter, "width", 0)} if learned else {}
             self.upsampler = upsampler(**asked)
         self.inpainter = inpainter
-        scale = getattr(self.upsampler, "scale", 1)
-        if inpainter is not None and scale != int(scale):
-            raise ValueError(
-                f"model.upsampler.scale: expected a whole number beside an inpainter, but got {scale}; "
-                "set it to 2, or choose model/inpainter=none"
-            )
+        if inpainter is not None:
+            scale, wanted = getattr(self.upsampler, "scale", 1), "a whole number beside an inpainter"
+            other = "set it to 2, or choose model/inpainter=none"
+            check_value("model.upsampler.scale", scale, wanted, lambda scale: scale == int(scale), other)
         self.begin(start)
 
     def at(self, moment: Moment) -> VoxelSnapshot:

@@ -24,6 +24,7 @@ from forewarp.fields.grids import (
 from forewarp.methods.method import Method, Snapshot, Start, Step
 from forewarp.methods.voxel.effects import Together
 from forewarp.methods.voxel.structure import VoxelStage, first_voxels, refresh, resample
+from forewarp.ops.backend import check_value
 from forewarp.ops.grid import neighbour_pairs
 from forewarp.ops.march import warm_up
 from forewarp.renderer import Marched, Renderer
@@ -183,11 +184,9 @@ class VoxelMethod(Method):
             ValueError: for what is neither a factory nor None, such as a number set in an option that was
                 then switched off.
         """
-        if option is not None and not callable(option):
-            raise ValueError(
-                f"model.{name}: expected a factory or null, but got {option!r}; "
-                f"choose model/{name}=none to switch it off"
-            )
+        if option is not None:
+            off = f"choose model/{name}=none to switch it off"
+            check_value(f"model.{name}", option, "a factory or null", callable, off)
         return option if name in self.stage.effects else None
 
     def begin(self, start: Start) -> None:
@@ -225,11 +224,9 @@ class VoxelMethod(Method):
         return VoxelSnapshot(moment, fields, canonical, self.renderer, shade, background=static, **found)
 
     @classmethod
-    def check(
-        cls, stage: str, numbers: Mapping[str, Any], terms: Iterable[str], literal: Iterable[str] = ()
-    ) -> None:
+    def check(cls, stage: str, numbers: Mapping[str, Any], *names: Iterable[str]) -> None:
         """See ``Method.check``; also refuse numbers out of range."""
-        super().check(stage, numbers, terms, literal)
+        super().check(stage, numbers, *names)
         if numbers:
             VoxelStage(name=stage, **numbers)
 

@@ -10,8 +10,9 @@ from torch import Tensor
 
 from forewarp.fields.grids import EMPTY, VoxelGrid
 from forewarp.methods.effect import Effect, Evidence
-from forewarp.methods.method import FRACTION, Start, check_number, steps_of, value_at
+from forewarp.methods.method import FRACTION, Start, check_effects, check_number, steps_of, value_at
 from forewarp.methods.rows import renew_parameters
+from forewarp.ops.backend import check_value
 from forewarp.ops.grid import dilate, trilinear
 from forewarp.scene.box import Box, Lattice
 from forewarp.scene.frame import visual_hull
@@ -87,20 +88,15 @@ class VoxelStage:
         where = f"stage.{self.name}"
         for key in ("num_voxels", "background_num_voxels", *(["bases"] if self.bases else [])):
             steps_of(f"{where}.{key}", getattr(self, key))
-        if not set(self.effects) <= set(NAMES):
-            raise ValueError(
-                f"{where}.effects: expected some of {', '.join(NAMES)}, but got {list(self.effects)}"
-            )
-        if self.start not in ("auto", "box", "hull"):
-            raise ValueError(f"{where}.start: expected auto, box or hull, but got '{self.start}'")
+        check_effects(f"{where}.effects", self.effects, NAMES)
+        starts = ("auto", "box", "hull")
+        check_value(f"{where}.start", self.start, "auto, box or hull", starts.__contains__)
         check_number(f"{where}.confine", self.confine, *FRACTION)
         for key in ("box_alpha", "start_alpha"):
             check_number(f"{where}.{key}", getattr(self, key), "a number in (0, 1)", lambda a: 0 < a < 1)
-        if not 0 < self.birth_alpha < self.keep_alpha < 1:
-            raise ValueError(
-                f"{where}: expected 0 < birth_alpha < keep_alpha < 1, or fog spreads, "
-                f"but got {self.birth_alpha}, {self.keep_alpha}"
-            )
+        wanted = "0 < birth_alpha < keep_alpha < 1, or fog spreads"
+        alphas = self.birth_alpha, self.keep_alpha
+        check_value(where, alphas, wanted, lambda pair: 0 < pair[0] < pair[1] < 1)
 
     def at(self, key: str, fraction: float) -> float | None:
         """Return the value of the schedule ``key`` at a fraction; None if it is empty."""
@@ -117,10 +113,8 @@ def first_voxels(start: Start, stage: VoxelStage, lattice: Lattice) -> Tensor:
     if start.blank or not hull:
         return everywhere
     if not scene.has_alpha:
-        raise ValueError(
-            f"stage.{start.stage}.start: expected box, since the images of '{scene.name}' have no alpha, "
-            "but got hull"
-        )
+        why = f"since the images of '{scene.name}' have no alpha"
+        raise ValueError(f"stage.{start.stage}.start: expected box, {why}, but got hull")
     frames, count = [scene.train[i] for i in start.frames], stage.hull_frames
     while count < len(frames) and frames[count].time == frames[count - 1].time:
         count += 1  # all views of each time: some neighbouring cameras alone bound nothing
