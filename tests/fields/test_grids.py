@@ -15,6 +15,7 @@ from forewarp.fields.grids import (
     density_shift,
     read_strided,
 )
+from forewarp.methods.method import Method
 from forewarp.ops.grid import occupied_cells, trilinear_reference
 from forewarp.scene.box import Box, Lattice
 from tests.support.hard_cases import index_with
@@ -130,17 +131,24 @@ def test_resampling_a_linear_field_is_exact_and_absent_voxels_read_empty():
     torch.testing.assert_close(none.density.data, torch.full((315, 1), -10.0))
 
 
+def holding(grid):
+    method = Method()
+    method.grid = grid
+    return method
+
+
 def test_a_checkpoint_brings_its_own_lattice():
     source = numbered(THIRD)
     source.resample(Lattice(LATTICE.box, (4, 4, 3)), torch.ones(4, 4, 3, dtype=torch.bool), {"density": 0.0})
-    grid = numbered(ALL)
-    parameter = grid.density
-    grid.load_state_dict(source.state_dict())
-    assert grid.lattice == source.lattice
-    assert grid.density is parameter  # an optimiser may hold it
+    stored, loaded = holding(source), holding(numbered(ALL))
+    parameter = loaded.grid.density
+    assert loaded.misfit(stored.state_dict()) is None
+    loaded.load_state_dict(stored.state_dict())
+    assert loaded.grid.lattice == source.lattice
+    assert loaded.grid.density is parameter  # an optimiser may hold it
     for name, value in source.state_dict().items():
         if torch.is_tensor(value):
-            assert torch.equal(grid.state_dict()[name], value)
+            assert torch.equal(loaded.grid.state_dict()[name], value)
 
 
 @pytest.mark.parametrize(

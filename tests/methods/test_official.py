@@ -100,7 +100,7 @@ def of_warp(method):
     strain = method.warp.elastic(seen.coarse.points.reshape(-1, 3), method.codes(0.5), 2.5)
     found["elastic"] = (seen.coarse.weights.reshape(-1) * strain).sum() / len(RAYS)
     if "elastic" in method.terms:  # of a step that had more rays than were looked along
-        term = method.extra_terms(seen, batch(), {}, torch.Generator())["elastic"]()
+        term = method.extra_terms(seen, batch(), torch.Generator())["elastic"]()
         torch.testing.assert_close(term * (144 / len(RAYS)), found["elastic"])
     code = method.codes(0.5)[None]
     return found | {"still": method.warp.stray(POINTS, code, 2.5, None, torch.Generator())}

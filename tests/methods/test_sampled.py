@@ -301,7 +301,7 @@ def test_the_second_time_is_a_neighbours_side_and_offsets_are_summed():
     made.offset = offset
     seen, generator = SimpleNamespace(points=torch.zeros(7, 4, 3)), draw()
     for time, low, high in ((0.0, 0.0, 0.5), (0.5, 0.0, 1.0), (1.0, 0.5, 1.0)):
-        term, between = made.extra_terms(seen, batch(time), {}, generator)["second_time"], []
+        term, between = made.extra_terms(seen, batch(time), generator)["second_time"], []
         for _ in range(200):
             value, (first, second) = float(term()), asked[-2:]
             assert first == time
@@ -362,7 +362,7 @@ def test_the_elastic_term_is_summed_over_coarse_samples_and_averaged_over_rays()
     seen = made.along(Moment(0.5), View(camera()).rays(), WHITE, generator)
     strain = made.warp.elastic(seen.coarse.points.reshape(-1, 3), made.codes(0.5), 0.0).detach()
     expected = float((seen.coarse.weights.detach().reshape(-1) * strain).sum() / 144)
-    term = made.extra_terms(seen, batch(), {}, generator)["elastic"]
+    term = made.extra_terms(seen, batch(), generator)["elastic"]
     found = term()
     found.backward()
     assert float(found.detach()) == pytest.approx(expected, rel=1e-4)
@@ -412,11 +412,11 @@ def test_each_view_of_a_batch_is_seen_by_the_code_of_its_camera():
 def test_points_that_never_move_are_pulled_to_stay(kind):
     made, generator = method(kind, still=torch.randn(50, 3), **GENTLE), draw()
     seen = made.along(Moment(0.5), View(camera()).rays(), WHITE, generator)
-    term = made.extra_terms(seen, batch(), {}, generator)["still"]
+    term = made.extra_terms(seen, batch(), generator)["still"]
     low = float(term().detach())
     torch.nn.init.constant_(made.warp.shift.bias, 0.1)
     assert low < 0.001 < 0.0019 < float(term().detach()) <= 0.002
-    assert method(kind, **GENTLE).extra_terms(seen, batch(), {}, generator)["still"]() is None
+    assert method(kind, **GENTLE).extra_terms(seen, batch(), generator)["still"]() is None
 
 
 def test_hypernerf_without_its_slice_is_the_nerfies_of_its_weights():

@@ -16,7 +16,7 @@ from forewarp.fields.grids import VoxelGrid, density_shift
 from forewarp.fields.networks import mlp
 from forewarp.fields.occupancy import Occupancy
 from forewarp.methods.method import Start, check_least, check_number, those_that_hold
-from forewarp.methods.rays import JUMP, NO_JUMP, MarchedMethod, Marching, regrow, whole_grid
+from forewarp.methods.rays import JUMP, NO_JUMP, MarchedMethod, Marching, Terms, regrow, whole_grid
 from forewarp.ops.backend import check_value
 from forewarp.ops.encode import encoded_size, positional_encoding
 from forewarp.ops.grid import dilate, second_variation, trilinear
@@ -196,9 +196,7 @@ class NDVG(MarchedMethod):
         found = looked.bounds(self.stage.box_alpha)
         return None if found is None else found.scaled(_BOX)
 
-    def extra_terms(
-        self, field: NDVGField, batch: Batch, generator: torch.Generator
-    ) -> dict[str, Callable[[], Tensor | None]]:
+    def extra_terms(self, field: NDVGField, batch: Batch, generator: torch.Generator) -> Terms:
         """Offer ``flow_l1``, the samples' offsets; ``tv_deformation``; ``canonical``, offsets of samples at
         the canonical time, which ``F`` should give as 0; ``still``, at points that never move.
 
@@ -225,12 +223,8 @@ class NDVG(MarchedMethod):
             points = self.some_still(_STILL, generator)
             return None if points is None else field.offset(points)[0].square().mean()
 
-        return {
-            "flow_l1": lambda: of_all(field.offsets),
-            "tv_deformation": tv_deformation,
-            "canonical": canonical,
-            "still": still,
-        }
+        terms = {"flow_l1": lambda: of_all(field.offsets), "tv_deformation": tv_deformation}
+        return terms | {"canonical": canonical, "still": still}
 
     def param_groups(self) -> dict[str, list[nn.Parameter]]:
         """Group parameters: ``density``, ``color`` and ``deformation`` (the grids), ``network``."""

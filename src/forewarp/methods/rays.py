@@ -45,6 +45,8 @@ JUMP = "offsets jump at the canonical time (continuous)"  # the fault that ``NO_
 OF_PYTORCH = (CENTRES, ALONG_RAYS, "no centre crop at first")
 OF_JAX = (ONE_TIME, BETWEEN_TIMES)
 
+Terms = dict[str, Callable[[], Tensor | None]]  # see ``Step``
+
 _PATIENCE = 20  # steps without a gradient after which a run ends
 _LOOK_EVERY = 8  # steps between two looks for where matter is
 _MASKS = 64  # most training images whose alpha says where matter may be
@@ -91,15 +93,21 @@ class RayMethod(Method):
 
     sees_by_camera = False
 
-    def along(
-        self, moment: Moment, rays: Rays, background: Tensor, generator: torch.Generator | None = None
-    ) -> Rendering:
-        """Render R rays over ``background`` (3,) or (R, 3); ``generator`` jitters the samples."""
+    def along(self, moment: Moment, rays: Rays, background: Tensor) -> Rendering:
+        """Render R rays over ``background`` (3,) or (R, 3)."""
         raise NotImplementedError
 
     def image(self, moment: Moment, rays: Rays, background: Tensor) -> Rendering:
         """Render an image's rays without gradient, in chunks for images of any size."""
         raise NotImplementedError
+
+    def parts_of(self, batch: Batch) -> list[tuple[Moment, Rays, Tensor]]:
+        """Return moment, rays and background of a batch of one time; by camera where that matters."""
+        parts = []
+        for part in batch.split() if self.sees_by_camera else [batch]:
+            rays, _, background = part.joined()
+            parts.append((part.observations[0].moment, rays.to(self.device), background.to(self.device)))
+        return parts
 
     def at(self, moment: Moment) -> RaySnapshot:
         """Fix the time; compute nothing yet."""
@@ -258,16 +266,14 @@ class SampledMethod(RayMethod):
         """
         raise NotImplementedError
 
-    def extra_terms(
-        self, seen: Sampled, batch: Batch, factors: Mapping[str, float], generator: torch.Generator
-    ) -> dict[str, Callable[[], Tensor | None]]:
+    def extra_terms(self, seen: Sampled, batch: Batch, generator: torch.Generator) -> Terms:
         """Return the loss terms beside the errors of the passes."""
         return {}
 
     def along(
         self, moment: Moment, rays: Rays, background: Tensor, generator: torch.Generator | None = None
     ) -> Sampled:
-        """See ``RayMethod``; also return what lies along the rays."""
+        """See ``RayMethod``; also return what lies along the rays. ``generator`` jitters the samples."""
         first, second = self.fields(moment)
         coarse = None if first is None else first.radiance
         return self.quadrature(second.density, second.radiance, rays, background, generator, coarse=coarse)
@@ -286,8 +292,8 @@ class SampledMethod(RayMethod):
             ValueError: if the density of a pass is 0 at every sample, or no sample is left, for many steps:
                 there is then no gradient.
         """
-        rgb, parts = batch.joined()[1], batch.split() if self.sees_by_camera else [batch]
-        seen = Sampled.joined([self._along_batch(part, generator) for part in parts])
+        rgb = batch.joined()[1]
+        seen = Sampled.joined([self.along(*part, generator) for part in self.parts_of(batch)])
         passes = [seen] if seen.coarse is None else [seen.coarse, seen]
         self.dead_start.look(all(bool((rendering.density > 0).any()) for rendering in passes))
         error = (seen.rgb - rgb).square().mean()
@@ -295,26 +301,22 @@ class SampledMethod(RayMethod):
         if "coarse_photo" in self.terms:
             terms["coarse_photo"] = lambda: seen.coarse and (seen.coarse.rgb - rgb).square().mean()
         return Step(
-            terms | self.extra_terms(seen, batch, factors, generator),
+            terms | self.extra_terms(seen, batch, generator),
             error.detach(),
             {"samples": seen.depths.numel(), "opacity": float(seen.opacity.detach().mean())},
             tensors=lambda: ((name, getattr(seen, name)) for name in ("density", "weights", "rgb")),
         )
 
-    def _along_batch(self, batch: Batch, generator: torch.Generator) -> Sampled:
-        (rays, _, background), moment = batch.joined(), batch.observations[0].moment
-        return self.along(moment, rays.to(self.device), background.to(self.device), generator)
-
     def advance(self, progress: float, step: int, optimizer: torch.optim.Optimizer) -> dict[str, float]:
         """See ``Method``; look now and then for where matter is."""
         if self.occupancy is None or step % _LOOK_EVERY:
             return {}
-
-        def density(points: Tensor, time: float) -> Tensor:
-            return self.fields(Moment(time))[1].density(points)
-
-        self.occupancy.look(density, self.times, torch.default_generator)
+        self.occupancy.look(self.density_at, self.times, torch.default_generator)
         return {"occupied": float(self.occupancy.occupied.float().mean())}
+
+    def density_at(self, points: Tensor, time: float) -> Tensor:
+        """World points (P, 3) and a time -> density (P,), per world unit."""
+        return self.fields(Moment(time))[1].density(points)
 
     def departures(self) -> list[str]:
         """See ``Method``; a subclass adds its own to those of the sampling and of the platform."""
@@ -378,9 +380,7 @@ class WarpedMethod(SampledMethod):
         """How many octaves of the warp's encoding count."""
         raise NotImplementedError
 
-    def extra_terms(
-        self, seen: Sampled, batch: Batch, factors: Mapping[str, float], generator: torch.Generator
-    ) -> dict[str, Callable[[], Tensor | None]]:
+    def extra_terms(self, seen: Sampled, batch: Batch, generator: torch.Generator) -> Terms:
         """Offer ``still``, at points that never move."""
 
         stray, codes = self.warp.stray, self.codes.table
@@ -501,9 +501,7 @@ class MarchedMethod(RayMethod):
         """Resample the lattices to about ``num_voxels`` voxels."""
         raise NotImplementedError
 
-    def extra_terms(
-        self, field: PointField, batch: Batch, generator: torch.Generator
-    ) -> dict[str, Callable[[], Tensor | None]]:
+    def extra_terms(self, field: PointField, batch: Batch, generator: torch.Generator) -> Terms:
         """Return the loss terms beside those of the rays.
 
         ``field`` has been asked at the rays' samples, or where it sees by camera at those of the first.
@@ -517,11 +515,9 @@ class MarchedMethod(RayMethod):
         rows = torch.randint(len(self.still), (min(count, len(self.still)),), generator=generator)
         return self.still[rows].to(self.device)
 
-    def along(
-        self, moment: Moment, rays: Rays, background: Tensor, generator: torch.Generator | None = None
-    ) -> Marched:
+    def along(self, moment: Moment, rays: Rays, background: Tensor) -> Marched:
         """See ``RayMethod``; also return the samples."""
-        return self.marched(self.field(moment), rays, background, generator)
+        return self.marched(self.field(moment), rays, background)
 
     def image(self, moment: Moment, rays: Rays, background: Tensor) -> Rendering:
         """See ``RayMethod``."""
@@ -545,13 +541,9 @@ class MarchedMethod(RayMethod):
         Raises:
             ValueError: if no sample has a colour for many steps.
         """
-        rgb, parts = batch.joined()[1], batch.split() if self.sees_by_camera else [batch]
-        fields, seen = [self.field(part.observations[0].moment) for part in parts], []
-        for field, part in zip(fields, parts):
-            rays, _, background = part.joined()
-            jitter = generator if self.marching.jitter else None
-            seen.append(self.marched(field, rays.to(self.device), background.to(self.device), jitter))
-        drawn = Marched.joined(seen)
+        rgb, jitter = batch.joined()[1], generator if self.marching.jitter else None
+        parts = [(self.field(moment), *part) for moment, *part in self.parts_of(batch)]
+        drawn = Marched.joined([self.marched(*part, jitter) for part in parts])
         self.dead_start.look(len(drawn.weights) > 0)
         error = (drawn.rgb - rgb).square().mean()
         terms = {
@@ -560,7 +552,7 @@ class MarchedMethod(RayMethod):
             "background_entropy": lambda: losses.background_entropy(drawn.transmittance),
         }
         return Step(
-            terms | self.extra_terms(fields[0], batch, generator),
+            terms | self.extra_terms(parts[0][0], batch, generator),
             error.detach(),
             {"samples": drawn.samples, "opacity": float(drawn.opacity.detach().mean())},
             tensors=lambda: ((name, getattr(drawn, name)) for name in ("weights", "colors", "rgb")),

@@ -201,7 +201,7 @@ def refusing(model=None, **numbers):
 
 SCHEDULE = r"stage.coarse.num_voxels: expected \[\[fraction, count\], ...\] .* but got"
 SPREADING = "stage.coarse: expected 0 < birth_alpha < keep_alpha < 1"
-SPLAT = "model.motion: expected 0 < tau <= 1, 0 <= fade <= 1 and"
+SPLAT = "model.motion.{}: expected a .* in "
 GHOST = "model.{0}: expected a factory or null, but got .*choose model/{0}=none"
 STAGES = [
     *(({"num_voxels": given}, SCHEDULE) for given in ([], [[0.5, 100], [0, 100]], 100, [[2, 9]], [[0, 0]])),
@@ -223,20 +223,24 @@ REFUSED = [
         (refusing(backward_model(deformation=wrong)), "model.deformation: expected a factory, but got")
         for wrong in (None, {"width": 3})
     ),
-    (refusing(forward_model(trajectory=None)), "model.trajectory: .* got null; choose another model/motion"),
+    (refusing(forward_model(trajectory=None)), "model.trajectory: .* got None; choose another model/motion"),
     *(
-        (lambda wrong=wrong: Motion(PATHS(), **wrong), SPLAT)
-        for wrong in ({"tau": 0.0}, {"tau": 2.0}, {"fade": -0.1}, {"fade": 1.5}, {"rest": 0.5})
+        (lambda key=key, wrong=wrong: Motion(PATHS(), **{key: wrong}), SPLAT.format(key))
+        for key, wrong in (("tau", 0.0), ("tau", 2.0), ("fade", -0.1), ("fade", 1.5), ("rest", 0.5))
     ),
-    *(
-        (partial(UNet3d, channels=4, **wrong), "model.inpainter: .* width that is a multiple of 16 and")
-        for wrong in ({"width": 12}, {"levels": 1})
+    (partial(UNet3d, channels=4, width=12), "model.inpainter.width: expected a multiple of 16, but got 12"),
+    (
+        partial(UNet3d, channels=4, levels=1),
+        "model.inpainter.levels: expected a whole number >= 2, but got 1",
     ),
     *(
         (partial(TrilinearUpsampler, scale=scale), "model.upsampler.scale: expected a number > 1, but got")
         for scale in (1, float("nan"))
     ),
-    (partial(LearnedUpsampler, scale=1.5, channels=4), "expects a whole number, but got 1.5"),
+    (
+        partial(LearnedUpsampler, scale=1.5, channels=4),
+        "expected a whole number for the learned layer, but got 1.5",
+    ),
     (refusing(ODD), "model.upsampler.scale: expected a whole number beside an inpainter, but got 1.5"),
     (refusing(start="hull"), "stage.coarse.start: expected box, since the images of 'ball' have no alpha"),
 ]

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
+from torch.optim import Optimizer
 
 from forewarp.fields.grids import EMPTY, VoxelGrid
 from forewarp.methods.effect import Effect, Evidence
@@ -126,7 +127,7 @@ def first_voxels(start: Start, stage: VoxelStage, lattice: Lattice) -> Tensor:
     return inside.reshape(lattice.shape) if bool(inside.any()) else everywhere
 
 
-def seen_rows(radiance: VoxelGrid, optimizer: torch.optim.Optimizer) -> Tensor:
+def seen_rows(radiance: VoxelGrid, optimizer: Optimizer) -> Tensor:
     """Voxels (N,) bool that some view has seen: their colour has had a gradient since the moments began."""
     name = "color" if "color" in radiance.names else radiance.names[0]
     moments = optimizer.state.get(radiance.parameter(name), {}).get("exp_avg_sq")
@@ -137,58 +138,41 @@ def seen_rows(radiance: VoxelGrid, optimizer: torch.optim.Optimizer) -> Tensor:
 
 @torch.no_grad()
 def refresh(
-    radiance: VoxelGrid,
-    optimizer: torch.optim.Optimizer,
-    *,
-    keep_alpha: float,
-    birth_alpha: float,
-    only_seen: bool = False,
-    allowed: Tensor | None = None,
-) -> bool:
+    radiance: VoxelGrid, stage: VoxelStage, optimizer: Optimizer, only_seen: bool, allowed: Tensor | None
+) -> None:
     """Activate the occupied voxels and their neighbours, and deactivate all others.
 
     Leave an empty grid as it is, so that a scene that has not appeared yet can still appear.
 
     Args:
         radiance: the grid; its active voxels change in place.
+        stage: for ``keep_alpha``, above which a voxel is occupied, and ``birth_alpha``, of new ones.
         optimizer: its moments follow the rows.
-        keep_alpha: opacity over one voxel above which a voxel is occupied.
-        birth_alpha: opacity of a new voxel; below ``keep_alpha``, or fog spreads.
         only_seen: also deactivate voxels that no view has seen, inside of solid objects.
         allowed: (X, Y, Z) bool, where voxels may become active; None: anywhere.
-
-    Returns:
-        whether the active voxels changed.
     """
     grid = radiance()
-    solid = grid.activation.alpha(grid.raw_density, grid.lattice.voxel_size) > keep_alpha
+    solid = grid.activation.alpha(grid.raw_density, grid.lattice.voxel_size) > stage.keep_alpha
     if only_seen:
         solid = solid & seen_rows(radiance, optimizer)
     mask = torch.zeros(grid.lattice.shape, dtype=torch.bool, device=solid.device)
     mask[radiance.voxels[solid].unbind(-1)] = True
     active = dilate(mask, 1) if allowed is None else (dilate(mask, 1) & allowed) | mask
-    if not bool(mask.any()) or torch.equal(active, radiance.index >= 0):
-        return False
-    before = radiance.rows()
-    rows = radiance.activate(active, radiance.births(birth_alpha))
-    renew_parameters(optimizer, before, radiance.rows(), rows)
-    return True
+    if bool(mask.any()) and not torch.equal(active, radiance.index >= 0):
+        before = radiance.rows()
+        rows = radiance.activate(active, radiance.births(stage.birth_alpha))
+        renew_parameters(optimizer, before, radiance.rows(), rows)
 
 
 @torch.no_grad()
 def resample(
-    radiance: VoxelGrid,
-    box: Box,
-    num_voxels: float,
-    *,
-    keep_alpha: float,
-    optimizer: torch.optim.Optimizer | None = None,
+    radiance: VoxelGrid, stage: VoxelStage, optimizer: Optimizer | None, box: Box, num_voxels: float,
     only_seen: bool = False,
-) -> None:
+) -> None:  # fmt: skip
     """Resample the grid to a lattice of about ``num_voxels`` over ``box``.
 
-    Activate the occupied voxels and their neighbours; if none is occupied, all. The grid's moments in the
-    optimiser start at 0.
+    Activate the voxels that are occupied by the stage's ``keep_alpha`` and their neighbours; if none is, all.
+    The grid's moments in the optimiser start at 0. ``only_seen``: as of ``refresh``.
     """
     source = radiance()
     lattice = Lattice.of_count(box, num_voxels)
@@ -200,7 +184,7 @@ def resample(
     last = torch.tensor(source.lattice.shape, device=points.device) - 1
     slack = 1e-3  # in voxels: keep the border of an equal box in spite of rounding
     inside = ((points >= -slack) & (points <= last + slack)).all(-1)
-    solid = (source.activation.alpha(raw, source.lattice.voxel_size) > keep_alpha) & inside
+    solid = (source.activation.alpha(raw, source.lattice.voxel_size) > stage.keep_alpha) & inside
     mask = dilate(solid.reshape(lattice.shape), 1)
     if not bool(mask.any()):
         mask = torch.ones_like(mask)
