@@ -20,34 +20,25 @@ KINDS = ("spline", "cosines")
 PADDING = 0.2  # of the sequence, imagined before and after it: a cosine stands still at both ends
 
 
-def _check_times(count: int) -> None:
-    wanted = "at least 2 distinct training times"
-    check_value("model.motion", count, wanted, lambda count: count >= 2, "choose model/motion=none")
-
-
 class Curve:
     """``sum_k c_k b_k(t)``. Cosines are exactly 0 at the canonical time; a spline is not: pictures of that
     time bend their own knots, and not what all others share.
 
     Args:
-        kind: ``spline``, whose knots bend their neighbourhood in time alone, or ``cosines``, the paper's DCT.
+        kind: of ``KINDS``: ``spline``, whose knots bend their neighbourhood in time alone, or ``cosines``,
+            the paper's DCT.
         count: of coefficients; a spline has at least 4, cosines at most one less than there are times. Of a
             ``straight`` spline two follow from the others, and it has two less, but no fewer than 4 of four
             times or more, and as many as there are times of fewer.
-        times: how many distinct training times there are.
+        times: how many distinct training times there are, at least 2.
         canonical_time: in [0, 1].
         straight: whether a spline ends without acceleration: what the first and the last picture leave open
             is then told by those beside them.
-
-    Raises:
-        ValueError: for another kind, or a single time, over which nothing moves.
     """
 
     def __init__(
         self, kind: str, count: int, times: int, canonical_time: float, *, straight: bool = False
     ) -> None:
-        check_value("model.motion", kind, f"{', '.join(KINDS)} or none", KINDS.__contains__)
-        _check_times(times)
         self.kind, self.times, self.canonical_time = kind, times, canonical_time
         self.straight = straight and kind == "spline"
         if kind == "cosines":
@@ -130,7 +121,8 @@ class TrajectoryField(nn.Module):
         padding: float = 0.0,
     ) -> None:
         super().__init__()
-        _check_times(frames)
+        wanted = "at least 2 distinct training times"
+        check_value("model.motion", frames, wanted, lambda count: count >= 2, "choose model/motion=none")
         self.box, self.frames, self.canonical_time = box, frames, canonical_time
         self.bases = min(bases, frames - 1)
         self.scale = 0.5 * max(box.size)

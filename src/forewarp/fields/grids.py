@@ -329,11 +329,12 @@ class CanonicalRadiance(VoxelGrid):
 
     def births(self, alpha: float) -> dict[str, float]:
         """Return the values of new voxels of an opacity by parameter; others get their neighbours' mean."""
-        return {}
+        density = {"density": self.activation.raw(alpha, self.lattice.voxel_size)}
+        return density if "density" in self.names else {}
 
     def empties(self) -> dict[str, float]:
         """Return the values of absent voxels by parameter, for resampling; others do not count them."""
-        return {}
+        return {"density": EMPTY} if "density" in self.names else {}
 
 
 class DirectRadiance(CanonicalRadiance):
@@ -359,15 +360,7 @@ class DirectRadiance(CanonicalRadiance):
     @torch.no_grad()
     def fill(self, alpha: float) -> None:
         """See ``CanonicalRadiance``."""
-        self.density.fill_(self.activation.raw(alpha, self.lattice.voxel_size))
-
-    def births(self, alpha: float) -> dict[str, float]:
-        """Return the density of an opacity; colour is averaged."""
-        return {"density": self.activation.raw(alpha, self.lattice.voxel_size)}
-
-    def empties(self) -> dict[str, float]:
-        """Return the density of absent voxels; colour is averaged."""
-        return {"density": EMPTY}
+        self.density.fill_(self.births(alpha)["density"])
 
 
 class FeatureRadiance(CanonicalRadiance):

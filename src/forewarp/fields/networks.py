@@ -6,6 +6,7 @@ import bisect
 import math
 from collections.abc import Sequence, Set
 from functools import partial
+from itertools import chain
 
 import torch
 from torch import Tensor, nn
@@ -86,16 +87,13 @@ class Trunk(nn.Module):
     ) -> None:
         super().__init__()
         if min(inputs, width, layers) < 1 or not (skip is None or 2 <= skip <= layers):
-            raise ValueError(
-                "trunk: expected inputs, width and layers >= 1 and a skip in [2, layers] or null, "
-                f"but got {inputs=}, {width=}, {layers=}, {skip=}"
-            )
+            wanted = "inputs, width and layers >= 1 and a skip in [2, layers] or null"
+            raise ValueError(f"trunk: expected {wanted}, but got {inputs=}, {width=}, {layers=}, {skip=}")
         self.skip = skip
         sizes = [inputs + besides, *[width] * (layers - 1)]
         self.layers = nn.ModuleList(
             nn.Linear(size + (inputs if number == skip else 0), width) for number, size in enumerate(sizes, 1)
         )
-
         if glorot:
             self.apply(start_as_glorot)
 
@@ -118,27 +116,21 @@ class Template(nn.Module):
     Args:
         inputs: channels of the encoded point.
         condition: channels that only colour depends on.
-        width, layers, skip, glorot: see ``Trunk``.
+        width, glorot: see ``Trunk``, of all layers.
+        trunk: layers and skip, see ``Trunk``.
 
     >>> sum(p.numel() for p in Template(63, 27).parameters())
     595844
     """
 
     def __init__(
-        self,
-        inputs: int,
-        condition: int,
-        *,
-        width: int = 256,
-        layers: int = 8,
-        skip: int | None = 6,
-        glorot: bool = False,
+        self, inputs: int, condition: int, *, width: int = 256, glorot: bool = False, **trunk
     ) -> None:
         super().__init__()
         if condition < 1 or width < 2:
             wanted = "condition >= 1 and width >= 2"
             raise ValueError(f"template: expected {wanted}, but got {condition=}, {width=}")
-        self.trunk = Trunk(inputs, width=width, layers=layers, skip=skip)
+        self.trunk = Trunk(inputs, width=width, **trunk)
         self.density_head = nn.Linear(width, 1)
         self.bottleneck = nn.Linear(width, width)
         self.shading = nn.Linear(width + condition, width // 2)
@@ -343,12 +335,10 @@ class PictureEncoder(nn.Module):
         good = len(size) == 2 and min(size) >= by and not any(side % by for side in size)
         check_value("model.picture_size", list(size), wanted, lambda _: good)
         steps = list(zip((3, *tower[:-1]), tower))
-        self.towers = nn.ModuleList(
-            nn.Sequential(
-                *(part for i, o in steps for part in (nn.Conv2d(i, o, 4, 2, 1), nn.LeakyReLU(_SLOPE)))
-            )
-            for _ in range(pictures)
-        )
+        self.towers = nn.ModuleList()
+        for _ in range(pictures):
+            layers = [(nn.Conv2d(i, o, 4, 2, 1), nn.LeakyReLU(_SLOPE)) for i, o in steps]
+            self.towers.append(nn.Sequential(*chain(*layers)))
         self.joined = nn.Linear(pictures * tower[-1] * (size[0] // by) * (size[1] // by), width)
         self.mean, self.deviation = nn.Linear(width, code), nn.Linear(width, code)
         self.apply(_start_leaky)
@@ -365,14 +355,11 @@ class PictureEncoder(nn.Module):
 class VolumeDecoder(nn.Module):
     """A code (C,) -> raw values (4, S, S, S), S = ``2**len(channels)``: three of colour, then opacity."""
 
-    def __init__(
-        self, code: int, channels: Sequence[int] = (1024, 512, 512, 256, 256, 128, 128), out: int = 4
-    ) -> None:
+    def __init__(self, code: int, channels: Sequence[int] = (1024, 512, 512, 256, 256, 128, 128)) -> None:
         super().__init__()
         self.first = nn.Linear(code, channels[0])
-        self.grow = nn.ModuleList(
-            nn.ConvTranspose3d(i, o, 4, 2, 1) for i, o in zip(channels, (*channels[1:], out))
-        )
+        steps = zip(channels, (*channels[1:], 4))
+        self.grow = nn.ModuleList(nn.ConvTranspose3d(i, o, 4, 2, 1) for i, o in steps)
         self.apply(_start_leaky)
         start_as_glorot(self.grow[-1])
 

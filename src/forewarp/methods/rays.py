@@ -470,7 +470,7 @@ class MarchedMethod(RayMethod):
             threshold = marching.color_threshold
         check_number(f"{where}.color_threshold", threshold, *_THRESHOLD)
         self.renderer = Renderer(step=marching.step, color_threshold=threshold)
-        self.occupancy = Occupancy(box, side=marching.occupancy, patience=8) if marching.occupancy else None
+        self.occupancy = Occupancy(box, side=marching.occupancy) if marching.occupancy else None
         advice = f"set it to 0, or a larger {alpha_key}, or preset.occupancy=0"
         self.dead_start = DeadStart("preset.color_threshold", "no sample of so much weight", advice)
 

@@ -75,10 +75,7 @@ def first_points(start: Start, count: int, shell: float = 0.0) -> Cloud:
         cloud = left[visible] if int(visible.sum()) >= _FEW else left
     elif scene.has_alpha:
         cloud = hull_surface(scene, list(start.frames), count)
-    if cloud is None:
-        cloud = measured(scene, count)
-    if cloud is None:
-        cloud = swept(scene, list(start.frames), count, shell)
+    cloud = cloud or measured(scene, count) or swept(scene, list(start.frames), count, shell)
     if cloud is None or len(cloud) < _FEW:
         cloud = anywhere(scene.box, count)
     return cloud if len(cloud) <= count else cloud[torch.randperm(len(cloud))[:count].sort().values]
@@ -97,13 +94,10 @@ def hull_surface(scene: Scene, frames: list[int], count: int) -> Cloud | None:
 
     Silhouettes are grown by how far later frames may have moved. Colours are means over the frames.
     """
-    frames = frames[:_FRAMES]
-    images = [scene.train[i].load() for i in frames]
-    cameras = [scene.train[i].camera for i in frames]
-    masks = []
-    for i, rgba in zip(frames, images):
-        delay = abs(scene.train[i].time - scene.canonical_time)
-        masks.append(dilate(rgba[..., 3] > 127, max(1, round(_DRIFT * delay * rgba.shape[1]))))
+    first = [scene.train[i] for i in frames[:_FRAMES]]
+    images, cameras = [frame.load() for frame in first], [frame.camera for frame in first]
+    drifts = [_DRIFT * abs(f.time - scene.canonical_time) * f.camera.width for f in first]
+    masks = [dilate(rgba[..., 3] > 127, max(1, round(drift))) for rgba, drift in zip(images, drifts)]
     side = max(max(camera.width, camera.height) for camera in cameras)  # small images tell no finer shape
     rough = Lattice.of_count(scene.box, min(_ROUGH, side) ** 3)
     points = rough.to_world(rough.all_voxels())
@@ -120,9 +114,8 @@ def hull_surface(scene: Scene, frames: list[int], count: int) -> Cloud | None:
     at = rough.to_lattice(fine.to_world(voxels)).round().long()
     at = torch.minimum(at.clamp(min=0), torch.tensor(rough.shape) - 1)
     maybe = allowed[at.unbind(-1)]
-    solid = torch.zeros(len(voxels), dtype=torch.bool)
-    solid[maybe] = visual_hull(fine.to_world(voxels[maybe]), cameras, masks)
-    solid = solid.reshape(fine.shape)
+    solid = torch.zeros(fine.shape, dtype=torch.bool)
+    solid.view(-1)[maybe] = visual_hull(fine.to_world(voxels[maybe]), cameras, masks)
     shell = (solid & dilate(~solid)).nonzero()
     if not len(shell):
         return None
@@ -189,15 +182,10 @@ def first_values(
         size = torch.where(beyond, apart, size)
     if widest is not None:
         size = torch.minimum(size, widest.clamp(min=1e-3 * median))
-    quaternions = torch.zeros(len(points), 4)
-    quaternions[:, 0] = 1
-    return {
-        "means": points.clone(),
-        "scales": size.log()[:, None].repeat(1, 3),
-        "quaternions": quaternions,
-        "opacity": torch.zeros(len(points), 1),
-        "colors": ((cloud.colors.float() - 0.5) / FLAT)[:, None].clone(),
-    }
+    shape = {"scales": size.log()[:, None].repeat(1, 3)}
+    shape["quaternions"] = torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(len(points), 1)
+    colors = ((cloud.colors.float() - 0.5) / FLAT)[:, None].clone()
+    return {"means": points.clone(), **shape, "opacity": torch.zeros(len(points), 1), "colors": colors}
 
 
 def measured(scene: Scene, count: int) -> Cloud | None:
@@ -289,8 +277,8 @@ def swept(scene: Scene, frames: list[int], count: int, shell: float = 0.0) -> Cl
             sizes += [size] if beyond == 1 else []
     if shell > 0:
         for i in spread(len(scene.train), _SHELLED):
-            new, color = _behind(small(i), max(4, side // _COARSER), torch.cat(points), shell)
-            points.append(new)
+            rays, color, _ = _holes(small(i), max(4, side // _COARSER), torch.cat(points))
+            points.append(rays.origins + shell * small(i)[2].far * rays.directions)
             colors.append(color)
     points, colors = torch.cat(points), torch.cat(colors)
     if not len(points):
@@ -363,14 +351,6 @@ def _neighbours(scene: Scene, i: int) -> list[int]:
     away = [float((frame.camera.center - scene.train[i].camera.center).norm()) for frame in scene.train]
     others = (j for j in range(len(times)) if j != i)
     return sorted(others, key=lambda j: (abs(times[j] - times[i]), away[j], abs(j - i)))[:_NEIGHBOURS]
-
-
-def _behind(image: tuple[Tensor, Tensor, Camera], side: int, before: Tensor, shell: float):
-    """Return points (P, 3) ``shell`` far planes away where an image's lattice shows none of those ``before``
-    (N, 3), and their colours (P, 3).
-    """
-    rays, color, _ = _holes(image, side, before)
-    return rays.origins + shell * image[2].far * rays.directions, color
 
 
 def _holes(image: tuple[Tensor, Tensor, Camera], side: int, before: Tensor) -> tuple[Rays, Tensor, int]:
