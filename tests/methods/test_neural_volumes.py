@@ -97,8 +97,9 @@ def test_priors_at_known_values():
     assert float(opacity_variation(step)) == pytest.approx((1 + 1e-5**0.5) / 2, rel=1e-4)
 
 
-def maps_of(turns=False, **options):
+def maps_of(**options):
     """A warp whose maps do not depend on the code."""
+    options = {"from_identity": False} | options
     warp = AffineMixture(4, maps=3, side=6, width=8, weight_width=8, **options)
     with torch.no_grad():
         for head in (warp.scale, warp.turn, warp.shift):
@@ -132,8 +133,9 @@ def released_deviation(layer, gain):
 def test_first_values_are_the_released_ones():
     torch.manual_seed(0)
     leaky = (2 / 1.04) ** 0.5
-    encoder, decoder = PictureEncoder(1, (32, 32), tower=(16, 32), width=64, code=24), VolumeDecoder(24)
-    warp = AffineMixture(24, maps=16, side=8)
+    encoder = PictureEncoder(1, (32, 32), tower=(16, 32), width=64, code=24)
+    decoder = VolumeDecoder(24, (1024, 512, 512, 256, 256, 128, 128))
+    warp = AffineMixture(24, maps=16, side=8, width=128, weight_width=64, from_identity=False)
     before_leaky = [encoder.towers[0][0], encoder.towers[0][2], encoder.joined, decoder.first]
     before_leaky += [decoder.grow[-2], warp.scale[0], warp.weight[0]]
     last = [encoder.mean, encoder.deviation, decoder.grow[-1], warp.turn[-1], warp.shift[-1], warp.weight[-1]]

@@ -27,6 +27,7 @@ from tests.support.sampled_methods import GENTLE, KINDS, SMALL, WARP, batch, lea
 from tests.support.still_cameras import camera, moving_scene, niche_scene, static_ceiling
 from tests.support.tiny_scene import make_run
 
+OF_WARP = {"frequencies": 6, "width": 128, "layers": 6, "skip": 5}
 POINT = 3 * (1 + 2 * 3)  # channels of an encoded point of the small methods
 BENT = ("nerfies", "hypernerf")  # space, by a warp
 WHITE = torch.ones(3)
@@ -314,7 +315,11 @@ def test_the_second_time_is_a_neighbours_side_and_offsets_are_summed():
 
 def test_nerfies_starts_as_near_the_identity_as_published():
     torch.manual_seed(0)
-    points, warp, code = 0.8 * torch.rand(500, 3) - 0.4, ScrewWarp(8), TimeCodes((0.0, 1.0), 8)(0.0)
+    points, warp, code = (
+        0.8 * torch.rand(500, 3) - 0.4,
+        ScrewWarp(8, **OF_WARP),
+        TimeCodes((0.0, 1.0), 8)(0.0),
+    )
     for window, published in ((0.0, 1.0e-4), (6.0, 1.3e-3)):
         moved = (warp(points, code, window) - points).norm(dim=-1).mean()
         assert float(moved.detach()) == pytest.approx(published, rel=0.5)
@@ -333,7 +338,7 @@ def test_octaves_that_are_not_in_count_nowhere(kind):
 
 
 def test_a_rigid_warp_is_not_elastic():
-    warp = ScrewWarp(8)
+    warp = ScrewWarp(8, **OF_WARP)
     with torch.no_grad():
         for head, value in ((warp.turn, torch.tensor([0.3, -0.2, 0.5])), (warp.shift, torch.full((3,), 0.4))):
             head.weight.zero_()

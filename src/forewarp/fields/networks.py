@@ -71,19 +71,12 @@ class Trunk(nn.Module):
         besides: channels that only the first layer reads, not the skip.
         glorot: start from Glorot's uniform weights and biases of 0, as JAX versions do; False: PyTorch's.
 
-    >>> sum(p.numel() for p in Trunk(72).parameters())
+    >>> sum(p.numel() for p in Trunk(72, width=256, layers=8, skip=6).parameters())
     497664
     """
 
     def __init__(
-        self,
-        inputs: int,
-        *,
-        width: int = 256,
-        layers: int = 8,
-        skip: int | None = 6,
-        besides: int = 0,
-        glorot: bool = False,
+        self, inputs: int, *, width: int, layers: int, skip: int | None, besides: int = 0, glorot=False
     ) -> None:
         super().__init__()
         if min(inputs, width, layers) < 1 or not (skip is None or 2 <= skip <= layers):
@@ -119,13 +112,11 @@ class Template(nn.Module):
         width, glorot: see ``Trunk``, of all layers.
         trunk: layers and skip, see ``Trunk``.
 
-    >>> sum(p.numel() for p in Template(63, 27).parameters())
+    >>> sum(p.numel() for p in Template(63, 27, width=256, layers=8, skip=6).parameters())
     595844
     """
 
-    def __init__(
-        self, inputs: int, condition: int, *, width: int = 256, glorot: bool = False, **trunk
-    ) -> None:
+    def __init__(self, inputs: int, condition: int, *, width: int, glorot: bool = False, **trunk) -> None:
         super().__init__()
         if condition < 1 or width < 2:
             wanted = "condition >= 1 and width >= 2"
@@ -236,19 +227,16 @@ class ScrewWarp(nn.Module):
     Args:
         code_size: channels of a code.
         frequencies: octaves of the points' encoding.
-        width, layers, skip: see ``Trunk``.
+        width, trunk: width, layers and skip, see ``Trunk``.
 
-    >>> sum(p.numel() for p in ScrewWarp(8).parameters())
+    >>> sum(p.numel() for p in ScrewWarp(8, frequencies=6, width=128, layers=6, skip=5).parameters())
     95494
     """
 
-    def __init__(
-        self, code_size: int, *, frequencies: int = 6, width: int = 128, layers: int = 6, skip: int | None = 5
-    ) -> None:
+    def __init__(self, code_size: int, *, frequencies: int, width: int, **trunk) -> None:
         super().__init__()
         self.frequencies = frequencies
-        inputs = encoded_size(3, frequencies) + code_size
-        self.trunk = Trunk(inputs, width=width, layers=layers, skip=skip, glorot=True)
+        self.trunk = Trunk(encoded_size(3, frequencies) + code_size, width=width, **trunk, glorot=True)
         self.turn, self.shift = nn.Linear(width, 3), nn.Linear(width, 3)
         for head in (self.turn, self.shift):
             nn.init.uniform_(head.weight, 0, _FIRST)
@@ -321,13 +309,7 @@ class PictureEncoder(nn.Module):
     """
 
     def __init__(
-        self,
-        pictures: int,
-        size: tuple[int, int],
-        *,
-        tower: Sequence[int] = (64, 64, 128, 128, 256, 256, 256),
-        width: int = 512,
-        code: int = 256,
+        self, pictures: int, size: tuple[int, int], *, tower: Sequence[int], width: int, code: int
     ) -> None:
         super().__init__()
         by = 2 ** len(tower)
@@ -355,7 +337,7 @@ class PictureEncoder(nn.Module):
 class VolumeDecoder(nn.Module):
     """A code (C,) -> raw values (4, S, S, S), S = ``2**len(channels)``: three of colour, then opacity."""
 
-    def __init__(self, code: int, channels: Sequence[int] = (1024, 512, 512, 256, 256, 128, 128)) -> None:
+    def __init__(self, code: int, channels: Sequence[int]) -> None:
         super().__init__()
         self.first = nn.Linear(code, channels[0])
         steps = zip(channels, (*channels[1:], 4))
@@ -386,14 +368,7 @@ class AffineMixture(nn.Module):
     """
 
     def __init__(
-        self,
-        code: int,
-        *,
-        maps: int = 16,
-        side: int = 32,
-        width: int = 128,
-        weight_width: int = 64,
-        from_identity: bool = False,
+        self, code: int, *, maps: int, side: int, width: int, weight_width: int, from_identity: bool
     ) -> None:
         super().__init__()
         self.maps, self.side, self.from_identity = maps, side, from_identity

@@ -344,6 +344,7 @@ class WarpedMethod(SampledMethod):
         network: width, layers, direction_frequencies: see ``SampledMethod``.
     """
 
+    octaves_in: float  # of the warp's encoding: how many count
     shares = {"warp_in": 0.32}  # of the stage, where its numbers do not say
     numbers = tuple(shares)
     published = "softplus"
@@ -374,11 +375,6 @@ class WarpedMethod(SampledMethod):
         for name in self.numbers:
             check_number(f"stage.{start.stage}.{name}", self.shares[name], *FRACTION)
         self.still, self.still_points = start.scene.still, still_points
-
-    @property
-    def octaves_in(self) -> float:
-        """How many octaves of the warp's encoding count."""
-        raise NotImplementedError
 
     def extra_terms(self, seen: Sampled, batch: Batch, generator: torch.Generator) -> Terms:
         """Offer ``still``, at points that never move."""
@@ -454,6 +450,7 @@ class MarchedMethod(RayMethod):
         alpha_key: of the opacity at first.
     """
 
+    lattice_marched: Lattice  # that a step is a share of, as it is now
     terms = ("photo", "point_color", "background_entropy")
     numbers = ("num_voxels", "color_threshold")
 
@@ -479,13 +476,8 @@ class MarchedMethod(RayMethod):
         self.register_buffer("voxels", torch.tensor(self.schedule[0][1], dtype=torch.float64))
         self.register_buffer("raised", torch.ones(len(self.param_groups()), dtype=torch.float64))
 
-    @property
-    def lattice_marched(self) -> Lattice:
-        """The lattice that a step is a share of, as it is now."""
-        raise NotImplementedError
-
     def marching_lattice(self, num_voxels: float) -> Lattice:
-        """Return that lattice with about ``num_voxels`` voxels."""
+        """Return ``lattice_marched`` with about ``num_voxels`` voxels."""
         raise NotImplementedError
 
     @property

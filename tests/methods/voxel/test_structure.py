@@ -117,7 +117,7 @@ def test_resample_follows_what_is_occupied():
     optimizer = adam(made, unseen=[0])
     before = made().density(torch.tensor([[2.0, 2.0, 3.0]]))
     place = LATTICE.to_world(torch.tensor([[2, 2, 3]]))
-    resample(made, STAGE, optimizer, Box((0, 0, 1), (5, 4, 6)), 1500, only_seen=True)
+    resample(made, STAGE, optimizer, Lattice.of_count(Box((0, 0, 1), (5, 4, 6)), 1500), only_seen=True)
     assert made.lattice.count == pytest.approx(1500, rel=0.2)
     torch.testing.assert_close(made().density(made.lattice.to_lattice(place)), before)
     reach = (made.lattice.to_world(made.voxels) - place).abs().amax(-1).max()
@@ -132,14 +132,14 @@ def test_resample_does_not_lose_the_border_to_rounding():
     made = DirectRadiance(Lattice(box, SHAPE), torch.ones(SHAPE, dtype=torch.bool), **COMMON)
     made.density.data[:] = AIR
     made.density.data[made.index[-1].flatten().long()] = SOLID
-    resample(made, STAGE, None, box, 800)
+    resample(made, STAGE, None, Lattice.of_count(box, 800))
     assert (made.index[-2:] >= 0).all()
     assert (made.index[:-2] < 0).all()
 
 
 def test_resample_of_an_empty_field_keeps_all_voxels():
     made = radiance()
-    resample(made, STAGE, None, LATTICE.box, 400)
+    resample(made, STAGE, None, Lattice.of_count(LATTICE.box, 400))
     assert (made.index >= 0).all()
 
 

@@ -327,6 +327,29 @@ def interpolate_dense(dense: Tensor, crop: Crop, scale: int) -> Tensor:
     return functional.interpolate(dense, size=crop.scaled(scale).shape, mode="trilinear", align_corners=True)
 
 
+def inpaint(
+    warped: RadianceGrid, coverage: Tensor | None, inpainter: nn.Module, upsampler: TrilinearUpsampler | None
+) -> tuple[RadianceGrid, RadianceGrid, Tensor]:
+    """Return the up-sampled grid before and after inpainting, and their difference, on the occupied box."""
+    crop = occupied_crop(warped.index, inpainter.margin)
+    dense = inputs = densify(warped, crop)
+    if inpainter.coverage_channel:
+        cover = warped.values.new_ones(len(warped.values)) if coverage is None else coverage.clamp(max=1)
+        cover = densify(warped.with_values(cover[:, None]), crop).clamp(min=0)
+        inputs = torch.cat([dense, cover], 1)
+    features = inpainter.features(inputs)
+    learned = isinstance(upsampler, LearnedUpsampler)
+    residual = upsampler.residual(features, crop) if learned else inpainter.residual(features)
+    lattice, region = warped.lattice, crop
+    if upsampler is not None:
+        scale = int(upsampler.scale)
+        lattice, region = refined(lattice, scale), crop.scaled(scale)
+        dense = interpolate_dense(dense, crop, scale)
+        residual = residual if learned else interpolate_dense(residual, crop, scale)
+    upsampled = sparsify(warped, lattice, region, dense)
+    return upsampled, sparsify(warped, lattice, region, dense + residual), residual
+
+
 class SphericalHarmonics(nn.Module):
     """Spherical harmonics of degree 1: ``sigmoid(c + sum_i Y_i(d) s_i)``; no parameters of its own.
 

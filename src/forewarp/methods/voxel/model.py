@@ -357,7 +357,7 @@ class VoxelMethod(Method):
             (present, since), num_voxels = self.followed[key], stage.at(key, progress)
             only_seen = stage.see_steps > 0 and step - since >= stage.see_steps
             if num_voxels != present:
-                resample(grid, stage, optimizer, grid.lattice.box, num_voxels, only_seen)
+                resample(grid, stage, optimizer, Lattice.of_count(grid.lattice.box, num_voxels), only_seen)
                 self.followed[key] = [num_voxels, step]
             elif due and progress >= stage.refresh_from:
                 confined = key == "num_voxels" and progress < stage.confine
@@ -448,9 +448,8 @@ def _resampled(
 
     ``key`` is that of the grid's schedule.
     """
-    num_voxels = stage.at(key, 0.0)
+    lattice = Lattice.of_count(box, stage.at(key, 0.0))
     if before is None:
-        lattice = Lattice.of_count(box, num_voxels)
         return lattice, torch.ones(lattice.shape, dtype=torch.bool)
-    resample(before, stage, None, box, num_voxels)
-    return before.lattice, before.index >= 0
+    resample(before, stage, None, lattice)
+    return lattice, before.index >= 0

@@ -15,7 +15,7 @@ from forewarp.methods.method import FRACTION, Start, check_effects, check_number
 from forewarp.methods.rows import renew_parameters
 from forewarp.ops.backend import check_value
 from forewarp.ops.grid import dilate, trilinear
-from forewarp.scene.box import Box, Lattice
+from forewarp.scene.box import Lattice
 from forewarp.scene.frame import visual_hull
 
 EFFECTS = (
@@ -166,20 +166,18 @@ def refresh(
 
 @torch.no_grad()
 def resample(
-    radiance: VoxelGrid, stage: VoxelStage, optimizer: Optimizer | None, box: Box, num_voxels: float,
-    only_seen: bool = False,
-) -> None:  # fmt: skip
-    """Resample the grid to a lattice of about ``num_voxels`` over ``box``.
+    grid: VoxelGrid, stage: VoxelStage, optimizer: Optimizer | None, lattice: Lattice, only_seen: bool = False
+) -> None:
+    """Resample the grid to another lattice.
 
     Activate the voxels that are occupied by the stage's ``keep_alpha`` and their neighbours; if none is, all.
     The grid's moments in the optimiser start at 0. ``only_seen``: as of ``refresh``.
     """
-    source = radiance()
-    lattice = Lattice.of_count(box, num_voxels)
+    source = grid()
     points = source.lattice.to_lattice(lattice.to_world(lattice.all_voxels(source.values.device)))
     raw = source.values[:, :1].detach()
     if only_seen and optimizer is not None:
-        raw = torch.where(seen_rows(radiance, optimizer)[:, None], raw, EMPTY)
+        raw = torch.where(seen_rows(grid, optimizer)[:, None], raw, EMPTY)
     raw = trilinear(raw.contiguous(), source.index, points, source.fill[:1])[:, 0]
     last = torch.tensor(source.lattice.shape, device=points.device) - 1
     slack = 1e-3  # in voxels: keep the border of an equal box in spite of rounding
@@ -188,7 +186,7 @@ def resample(
     mask = dilate(solid.reshape(lattice.shape), 1)
     if not bool(mask.any()):
         mask = torch.ones_like(mask)
-    before = radiance.rows()
-    radiance.resample(lattice, mask, radiance.empties())
+    before = grid.rows()
+    grid.resample(lattice, mask, grid.empties())
     if optimizer is not None:
-        renew_parameters(optimizer, before, radiance.rows(), None)
+        renew_parameters(optimizer, before, grid.rows(), None)
