@@ -106,8 +106,8 @@ OF_PARTICLES = {
     "motion": Effect({"motion": "spline"}, calls(Nodes, "motion_and_maps", "backward"), ("nodes",)),
     "rotation": Effect({"rotation": True}, (), ("nodes.rotations",)),
     "view_dependence": Effect({"view_dependence": 1}, (), ("sh",)),
-    "color_over_time": Effect({"color_over_time": 1}, calls(Particles, "color_basis")),
-    "opacity_over_time": Effect({"opacity_over_time": 1}, calls(Particles, "opacity_basis")),
+    "color_over_time": Effect({"color_over_time": 1}, ()),
+    "opacity_over_time": Effect({"opacity_over_time": 1}, ()),
     "exposure": Effect({"exposure": 1}, calls(exposure, "gain_and_bias", "lit", "to_unlit")),
     "background": Effect({"background": 0.03}, (), ("resting", "nodes.stopped")),
 }
