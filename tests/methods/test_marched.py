@@ -7,7 +7,6 @@ from functools import partial
 import pytest
 import torch
 
-from forewarp.data.module import SceneDataModule
 from forewarp.fields.grids import RadianceGrid
 from forewarp.methods.method import Start
 from forewarp.methods.ndvg import NDVG
@@ -16,12 +15,8 @@ from forewarp.methods.tineuvox import TiNeuVox
 from forewarp.renderer import Renderer
 from forewarp.scene.cloud import Handover
 from forewarp.scene.view import Batch, Moment, View
-from forewarp.training.objective import Objective
-from forewarp.training.schedule import StageSettings
-from forewarp.training.stages import Stage
-from tests.support.sampled_methods import batch
+from tests.support.sampled_methods import batch, psnr_after
 from tests.support.still_cameras import camera, moving_scene, static_ceiling
-from tests.support.tiny_scene import make_run
 
 SMALL = {"tineuvox": {"width": 16, "position_frequencies": 3}, "ndvg": {"width": (16, 16)}}
 KINDS = {"tineuvox": TiNeuVox, "ndvg": NDVG}
@@ -351,11 +346,7 @@ def test_it_learns_what_moves(kind, tmp_path):
     rate = {"grid": 8e-2, "density": 0.1, "color": 0.1, "network": 5e-3}
     rate["deformation"] = 3e-3 if kind == "tineuvox" else 0.1
     lr = {name: rate[name] for name in method(kind).param_groups()}
-    numbers = {"curriculum": {"all_in": 0.0}, "num_voxels": [[0, 9**3], [0.2, 17**3]]}
-    settings = StageSettings.of("fine", lr=lr, iterations=400, **numbers)
     weights = {"photo": 1.0, "point_color": 1e-2, "background_entropy": 1e-3}
-    data = SceneDataModule(moving_scene, rays=96)
     model = partial(KINDS[kind], **SMALL[kind], marching=Marching(jitter=True))
-    module = make_run(tmp_path, [Stage(settings, Objective(weights))], data=data, model=model).fit()
-    psnr = [float(module.psnr_of(target)) for target in data.targets("train")]
-    assert sum(psnr) / len(psnr) > static_ceiling() + 3
+    how = {"lr": lr, "iterations": 400, "num_voxels": [[0, 9**3], [0.2, 17**3]]}
+    assert psnr_after(model, tmp_path, weights, **how) > static_ceiling() + 3

@@ -7,7 +7,6 @@ import pytest
 import torch
 from torch.autograd import gradcheck
 
-from forewarp.data.module import SceneDataModule
 from forewarp.fields.networks import AffineMixture, PictureEncoder, VolumeDecoder, read
 from forewarp.methods.method import Start, parameter_count
 from forewarp.methods.neural_volumes import (
@@ -21,23 +20,14 @@ from forewarp.methods.neural_volumes import (
 from forewarp.scene.camera import Rays
 from forewarp.scene.frame import Frame
 from forewarp.scene.view import Batch, Moment, Observation, View
-from forewarp.training.objective import Objective
-from forewarp.training.schedule import StageSettings
-from forewarp.training.stages import Stage
+from tests.support.sampled_methods import psnr_after
 from tests.support.still_cameras import TIMES, camera, moving_scene, picture, static_ceiling
-from tests.support.tiny_scene import make_run
 
 SMALL = {"picture_size": (16, 16), "tower": (8, 16), "features": 32, "code": 12, "decoder": (32, 16, 16, 8)}
 SMALL |= {"maps": 4, "warp_side": 6, "warp_width": 16, "weight_width": 8, "step": 1 / 16}
 WHITE = torch.ones(3)
-KIND = partial(
-    NeuralVolumes,
-    **SMALL,
-    from_identity=True,
-    first_opacity=0.1,
-    first_deviation=0.05,
-    jitter_in_pictures=False,
-)
+MENDED = {"from_identity": True, "first_opacity": 0.1, "first_deviation": 0.05, "jitter_in_pictures": False}
+KIND = partial(NeuralVolumes, **SMALL, **MENDED)
 WEIGHTS = {"photo": 104.04, "code_prior": 1e-3, "opacity_prior": 1e-2, "opacity_variation": 1e-2}
 
 
@@ -302,22 +292,15 @@ def test_gradients_against_differences():
     assert gradcheck(look, [torch.randn(4, dtype=torch.float64, requires_grad=True)])
 
 
-def fitted(tmp_path, scene, steps):
-    settings = StageSettings.of("fine", lr={"network": 5e-3}, iterations=steps, curriculum={"all_in": 0.0})
-    data = SceneDataModule(scene, rays=144)
-    module = make_run(tmp_path, [Stage(settings, Objective(WEIGHTS))], data=data, model=KIND).fit()
-    psnr = [float(module.psnr_of(target)) for target in data.targets("train")]
-    return sum(psnr) / len(psnr)
-
-
 @pytest.mark.slow
 def test_one_view_is_learned_beyond_the_background_alone(tmp_path):
     scene = replace(moving_scene(), train=moving_scene().train[:1])
     truth = scene.train[0].load().double() / 255
     bare = -10 * torch.log10((truth[..., 3:] * (1 - truth[..., :3])).square().mean())
-    assert fitted(tmp_path, lambda: scene, 60) > bare + 3
+    how = {"read": lambda: scene, "rays": 144, "iterations": 60}
+    assert psnr_after(KIND, tmp_path, WEIGHTS, **how) > bare + 3
 
 
 @pytest.mark.slow
 def test_it_learns_what_moves(tmp_path):
-    assert fitted(tmp_path, moving_scene, 300) > static_ceiling() + 3
+    assert psnr_after(KIND, tmp_path, WEIGHTS, rays=144, iterations=300) > static_ceiling() + 3

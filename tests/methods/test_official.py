@@ -44,12 +44,8 @@ MAKE = {
     "tineuvox": partial(TiNeuVox, width=16, camera=True),
     "neural_volumes": partial(NeuralVolumes, **VOLUMES),
 }
-SMALL = (
-    "warp.turn",
-    "warp.shift",
-    "network.6",
-    "offsets.4",
-)  # last layers of warps, which are to move points a little
+# Last layers of warps, which are to move points a little.
+SMALL = ("warp.turn", "warp.shift", "network.6", "offsets.4")
 
 
 def made(kind):

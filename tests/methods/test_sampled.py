@@ -10,7 +10,6 @@ import torch
 from torch.autograd import gradcheck
 from torch.testing import assert_close
 
-from forewarp.data.module import SceneDataModule
 from forewarp.fields.networks import ScrewWarp, TimeCodes
 from forewarp.methods.dnerf import DNeRF
 from forewarp.methods.hypernerf import HyperNeRF
@@ -20,12 +19,8 @@ from forewarp.methods.rays import NO_JUMP, OF_JAX, OF_PYTORCH, Sampling
 from forewarp.methods.tnerf import TNeRF
 from forewarp.ops.encode import positional_encoding
 from forewarp.scene.view import Batch, Moment, Observation, View
-from forewarp.training.objective import Objective
-from forewarp.training.schedule import StageSettings
-from forewarp.training.stages import Stage
-from tests.support.sampled_methods import GENTLE, KINDS, SMALL, WARP, batch, learned, method, shown, start
+from tests.support.sampled_methods import GENTLE, KINDS, SMALL, WARP, batch, method, psnr_after, shown, start
 from tests.support.still_cameras import camera, moving_scene, niche_scene, static_ceiling
-from tests.support.tiny_scene import make_run
 
 OF_WARP = {"frequencies": 6, "width": 128, "layers": 6, "skip": 5}
 POINT = 3 * (1 + 2 * 3)  # channels of an encoded point of the small methods
@@ -222,16 +217,6 @@ WITHOUT_WARP = "as Nerfies without its warp (the configuration was not published
 def test_departures_and_faults_are_those_of_the_publication(make, departures, faults):
     expected = {"departures": "; ".join(departures), "faults": "; ".join(faults)}
     assert make(start()).protocol() == {name: text for name, text in expected.items() if text}
-
-
-def test_nerf_draws_the_same_picture_at_all_times():
-    made, view = skipping("nerf"), View(camera())
-    with torch.no_grad():
-        first, later = (made.at(Moment(time)).render(view, WHITE) for time in (0.0, 0.7))
-    assert first.rgb.equal(later.rgb)
-    assert first.depth.equal(later.depth)
-    first, later = (made.along(Moment(time), view.rays(), WHITE) for time in (0.0, 0.7))
-    assert first.coarse.rgb.equal(later.coarse.rgb)
 
 
 @torch.no_grad()
@@ -454,7 +439,9 @@ def test_pictures_of_a_jittered_method_are_drawn_alike():
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_it_learns_what_moves(kind, tmp_path):
-    psnr, ceiling = learned(kind, tmp_path)[1], static_ceiling()
+    weights = dict.fromkeys({"photo", "coarse_photo"} & set(KINDS[kind].func.terms), 1.0)
+    model = partial(KINDS[kind], sampling=Sampling(12, 12, **GENTLE))
+    psnr, ceiling = psnr_after(model, tmp_path, weights, iterations=260), static_ceiling()
     assert ceiling - 3 < psnr <= ceiling if kind == "nerf" else psnr > ceiling + 3
 
 
@@ -473,12 +460,9 @@ def test_fields_that_know_the_time_show_what_appears_better_than_bent_ones(tmp_p
     """Each beside the one that it adds the time, or its slice, to."""
     psnr, rates = {}, {"lr": {"network": 3e-3}, "lr_final_factor": 0.1}
     for kind, (model, steps) in OF_THE_NICHE.items():
-        settings = StageSettings.of("fine", iterations=steps, curriculum={"all_in": 0.0}, **rates)
         weights = {"photo": 1.0} | ({"elastic": 1e-3} if kind == "nerfies" else {})
-        data = SceneDataModule(niche_scene, rays=128, seed=2)
-        model = partial(model, sampling=Sampling(16, 0, density="softplus", open_end=False))
-        run = make_run(tmp_path / kind, [Stage(settings, Objective(weights))], data=data, model=model)
-        module = run.fit()
-        psnr[kind] = sum(float(module.psnr_of(target)) for target in data.targets("train")) / 8
+        model = partial(model, sampling=Sampling(16, 0, **GENTLE))
+        how = {"read": niche_scene, "rays": 128, "seed": 2, "iterations": steps}
+        psnr[kind] = psnr_after(model, tmp_path / kind, weights, **how, **rates)
     assert psnr["tnerf"] > psnr["dnerf"] + 1, psnr
     assert psnr["hypernerf"] > psnr["nerfies"] + 1, psnr
