@@ -7,15 +7,14 @@ import pytest
 import torch
 from torch.autograd import gradcheck
 
-from forewarp.fields.networks import AffineMixture, PictureEncoder, VolumeDecoder, read
+from forewarp.methods import neural_volumes
 from forewarp.methods.method import Start, parameter_count
 from forewarp.methods.neural_volumes import (
+    AffineMixture,
     NeuralVolumes,
+    PictureEncoder,
+    VolumeDecoder,
     Volumes,
-    code_prior,
-    fitted_picture,
-    opacity_prior,
-    opacity_variation,
 )
 from forewarp.scene.camera import Rays
 from forewarp.scene.frame import Frame
@@ -78,13 +77,15 @@ def test_opacity_adds_up_along_a_ray(opacity, reached, seed):
 
 def test_priors_at_known_values():
     for opacity, value in ((0.0, 0.0), (1.0, 0.0), (0.5, 1.186)):
-        assert float(opacity_prior(torch.full((5,), opacity))) == pytest.approx(value, abs=1e-3)
-    assert float(code_prior(torch.zeros(4), torch.zeros(4))) == 0
-    assert float(code_prior(torch.ones(4), torch.zeros(4))) == pytest.approx(0.5)
-    assert float(opacity_variation(torch.full((3, 4, 5), 0.3))) == pytest.approx(1e-5**0.5)
+        assert float(neural_volumes.opacity_prior(torch.full((5,), opacity))) == pytest.approx(
+            value, abs=1e-3
+        )
+    assert float(neural_volumes.code_prior(torch.zeros(4), torch.zeros(4))) == 0
+    assert float(neural_volumes.code_prior(torch.ones(4), torch.zeros(4))) == pytest.approx(0.5)
+    assert float(neural_volumes.opacity_variation(torch.full((3, 4, 5), 0.3))) == pytest.approx(1e-5**0.5)
     step = torch.ones(3, 3, 3)
     step[2] = torch.e
-    assert float(opacity_variation(step)) == pytest.approx((1 + 1e-5**0.5) / 2, rel=1e-4)
+    assert float(neural_volumes.opacity_variation(step)) == pytest.approx((1 + 1e-5**0.5) / 2, rel=1e-4)
 
 
 def maps_of(**options):
@@ -157,7 +158,7 @@ def test_a_volume_is_read_with_x_last_and_points_on_its_corners():
     volume = torch.zeros(1, 3, 4, 5)
     volume[0, 0, 3, 4] = 1.0
     points = torch.tensor([[1.0, 1.0, -1.0], [0.75, 1.0, -1.0], [1.5, 1.0, -1.0]])
-    torch.testing.assert_close(read(volume, points)[:, 0], torch.tensor([1.0, 0.5, 0.0]))
+    torch.testing.assert_close(neural_volumes.read(volume, points)[:, 0], torch.tensor([1.0, 0.5, 0.0]))
 
 
 def test_pictures_are_of_cameras_that_see_every_instant():
@@ -173,7 +174,7 @@ def test_pictures_are_of_cameras_that_see_every_instant():
 def test_a_picture_is_fitted_over_white():
     rgba = torch.zeros(4, 8, 4, dtype=torch.uint8)
     rgba[:, 4:] = torch.tensor([10, 20, 30, 255], dtype=torch.uint8)
-    small = fitted_picture(rgba, (6, 8))
+    small = neural_volumes.fitted_picture(rgba, (6, 8))
     assert (small[:, 1:5, :2] == 255).all()
     assert small[:, 1, 7].tolist() == [10, 20, 30]
     assert (small[:, [0, 5]] == 100).all()  # the mean of pictures, which the encoder reads as 0
@@ -287,7 +288,7 @@ def test_gradients_against_differences():
     def look(code):
         volumes = made.volumes(code)
         seen = made.march(volumes, rays, torch.ones(3).double(), made.tint(0))
-        return seen.rgb.sum(), seen.opacity.sum(), opacity_variation(volumes.template[3])
+        return seen.rgb.sum(), seen.opacity.sum(), neural_volumes.opacity_variation(volumes.template[3])
 
     assert gradcheck(look, [torch.randn(4, dtype=torch.float64, requires_grad=True)])
 

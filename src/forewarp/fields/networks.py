@@ -1,20 +1,15 @@
-"""Networks that several methods learn: perceptrons, NeRF's trunk and template, codes, screws, volumes."""
+"""Networks that several methods learn: perceptrons, NeRF's trunk and template, codes, screws."""
 
 from __future__ import annotations
 
 import bisect
 import math
 from collections.abc import Sequence, Set
-from functools import partial
-from itertools import chain
 
 import torch
 from torch import Tensor, nn
-from torch.nn import functional
 
-from forewarp.ops.backend import check_value
 from forewarp.ops.encode import encoded_size, positional_encoding
-from forewarp.ops.gaussians import rotations
 from forewarp.ops.nodes import geman_mcclure, move_by_screw, stretch
 
 
@@ -288,131 +283,3 @@ def drawn(rows: Tensor, count: int | None, generator: torch.Generator) -> Tensor
     if count is None or len(rows) <= count:
         return rows
     return rows[torch.randperm(len(rows), generator=generator)[:count].to(rows.device)]
-
-
-DEVIATION_SCALE = 0.01  # of the layer that gives the logarithm of the deviation
-_SLOPE = 0.2  # of leaky ReLUs
-_LEAST = 1e-3  # least total weight of the maps at a point
-_SHORT = 1e-5  # added to the squared length of a quaternion
-_start_leaky = partial(start_as_glorot, gain=nn.init.calculate_gain("leaky_relu", _SLOPE))
-
-
-class PictureEncoder(nn.Module):
-    """Pictures of an instant (K, 3, H, W) -> mean and logarithm of the deviation of a code, (C,) each.
-
-    Args:
-        pictures: K, each with convolutions of its own.
-        size: H and W, multiples of ``2**len(tower)``.
-        tower: channels of the convolutions (4 x 4, stride 2).
-        width: channels of the layer that joins the pictures.
-        code: C.
-    """
-
-    def __init__(
-        self, pictures: int, size: tuple[int, int], *, tower: Sequence[int], width: int, code: int
-    ) -> None:
-        super().__init__()
-        by = 2 ** len(tower)
-        wanted = f"height and width in multiples of {by}, as the tower halves {len(tower)} times"
-        good = len(size) == 2 and min(size) >= by and not any(side % by for side in size)
-        check_value("model.picture_size", list(size), wanted, lambda _: good)
-        steps = list(zip((3, *tower[:-1]), tower))
-        self.towers = nn.ModuleList()
-        for _ in range(pictures):
-            layers = [(nn.Conv2d(i, o, 4, 2, 1), nn.LeakyReLU(_SLOPE)) for i, o in steps]
-            self.towers.append(nn.Sequential(*chain(*layers)))
-        self.joined = nn.Linear(pictures * tower[-1] * (size[0] // by) * (size[1] // by), width)
-        self.mean, self.deviation = nn.Linear(width, code), nn.Linear(width, code)
-        self.apply(_start_leaky)
-        for last in (self.mean, self.deviation):
-            start_as_glorot(last)
-
-    def forward(self, pictures: Tensor) -> tuple[Tensor, Tensor]:
-        """See the class."""
-        seen = [tower(one[None]).flatten() for tower, one in zip(self.towers, pictures, strict=True)]
-        hidden = functional.leaky_relu(self.joined(torch.cat(seen)), _SLOPE)
-        return 0.1 * self.mean(hidden), DEVIATION_SCALE * self.deviation(hidden)
-
-
-class VolumeDecoder(nn.Module):
-    """A code (C,) -> raw values (4, S, S, S), S = ``2**len(channels)``: three of colour, then opacity."""
-
-    def __init__(self, code: int, channels: Sequence[int]) -> None:
-        super().__init__()
-        self.first = nn.Linear(code, channels[0])
-        steps = zip(channels, (*channels[1:], 4))
-        self.grow = nn.ModuleList(nn.ConvTranspose3d(i, o, 4, 2, 1) for i, o in steps)
-        self.apply(_start_leaky)
-        start_as_glorot(self.grow[-1])
-
-    def forward(self, code: Tensor) -> Tensor:
-        """See the class."""
-        volume = self.first(code).reshape(1, -1, 1, 1, 1)
-        for layer in self.grow:
-            volume = layer(functional.leaky_relu(volume, _SLOPE))
-        return volume[0]
-
-
-class AffineMixture(nn.Module):
-    """An inverse warp: ``W(x) = sum_i g_i(A_i x) A_i x / max(sum_i g_i(A_i x), 0.001)`` with affine maps
-    ``A_i x = s_i * R_i (x - t_i)`` and decoded weights ``g_i`` on a lattice, beyond which they are as at its
-    border.
-
-    Args:
-        code: C.
-        maps: their number.
-        side: lattice points along an axis of the weights and of W.
-        width, weight_width: hidden channels of the maps and of the weights.
-        from_identity: add 1 to ``s`` and the identity to ``R``, so that W is near the identity where codes
-            are small. As released, scales of either sign and any rotations are mixed at first.
-    """
-
-    def __init__(
-        self, code: int, *, maps: int, side: int, width: int, weight_width: int, from_identity: bool
-    ) -> None:
-        super().__init__()
-        self.maps, self.side, self.from_identity = maps, side, from_identity
-
-        def head(hidden: int, out: int) -> nn.Sequential:
-            return nn.Sequential(nn.Linear(code, hidden), nn.LeakyReLU(_SLOPE), nn.Linear(hidden, out))
-
-        self.scale, self.turn, self.shift = (head(width, maps * size) for size in (3, 4, 3))
-        self.weight = head(weight_width, maps * side**3)
-        self.apply(_start_leaky)
-        for branch in (self.scale, self.turn, self.shift, self.weight):
-            start_as_glorot(branch[-1])
-        axis = torch.linspace(-1, 1, side)
-        z, y, x = torch.meshgrid(axis, axis, axis, indexing="ij")
-        self.register_buffer("lattice", torch.stack([x, y, z], -1), persistent=False)
-
-    def moved(self, code: Tensor, points: Tensor) -> Tensor:
-        """Apply each map to points (..., 3): (M, ..., 3)."""
-        scale = self.scale(code).reshape(self.maps, 3)
-        turn = self.turn(code).reshape(self.maps, 4)
-        shift = 0.1 * self.shift(code).reshape(self.maps, 3)
-        if self.from_identity:
-            scale = 1 + scale
-            turn = turn + turn.new_tensor([1.0, 0.0, 0.0, 0.0])
-        squared, eye = turn.square().sum(-1)[:, None, None], torch.eye(3).to(turn)
-        rotation = eye + (rotations(turn) - eye) * squared / (squared + _SHORT)  # smooth also where turn is 0
-        flat = points.reshape(-1, 3) - shift[:, None]
-        found = scale[:, None] * (flat @ rotation.mT)
-        return found.reshape(self.maps, *points.shape)
-
-    def forward(self, code: Tensor) -> Tensor:
-        """Code (C,) -> W at the lattice's points (3, S, S, S)."""
-        places = self.moved(code, self.lattice)
-        weights = self.weight(code).exp().reshape(self.maps, 1, *[self.side] * 3)
-        weights = functional.grid_sample(weights, places, padding_mode="border", align_corners=True)
-        weights = weights[:, 0, ..., None]
-        whole = (weights * places).sum(0) / weights.sum(0).clamp(min=_LEAST)
-        return whole.permute(3, 0, 1, 2)
-
-
-def read(volume: Tensor, points: Tensor, padding: str = "zeros") -> Tensor:
-    """Read a volume (C, S, S, S) at points (N, 3) of the cube, trilinearly: (N, C).
-
-    Beyond the cube lies 0, or with padding ``border`` what is nearest.
-    """
-    at = points.reshape(1, 1, 1, -1, 3)
-    return functional.grid_sample(volume[None], at, padding_mode=padding, align_corners=True)[0, :, 0, 0].T

@@ -19,14 +19,7 @@ from forewarp.methods.particles.nodes import Nodes, Skinning, TimeOffsets, are_r
 from forewarp.methods.particles.options import EFFECTS, SMALLEST, Effects, Numbers, view_share
 from forewarp.methods.particles.queries import Queries
 from forewarp.methods.particles.shared import begin_window, check_still, left_alone
-from forewarp.methods.particles.start import (
-    at_rest,
-    compile_kernels,
-    covered_pixels,
-    first_points,
-    first_values,
-    widths,
-)
+from forewarp.methods.particles.start import at_rest, compile_kernels, first_values, fresh_values
 from forewarp.methods.rows import RowsAdam
 from forewarp.ops.gaussians import BLUR, CHUNK, DEEP, Gaussians, Warp, compare
 from forewarp.ops.nodes import pull_nodes
@@ -178,16 +171,8 @@ class Particles(Queries):
             values = first_values(Cloud(torch.zeros(1, 3), torch.zeros(1, 3), torch.zeros(1), 1.0))
             values |= {"shared": torch.tensor([-1])} if start.shares else {}
         else:
-            covered = covered_pixels(start.scene, list(start.frames))
-            count = round(self.stage.initial_share * self.stage.final_count(covered, self.views))
-            cloud = first_points(start, count, 0.0 if self.box is None else self.stage.shell)
-            beyond = self.beyond(cloud.points)
-            near = cloud.points if bool(beyond.all()) else cloud.points[~beyond]
-            distances = (near - near.median(0).values).norm(dim=-1)
-            extent = float(distances.median()) or start.scene.box.diagonal
-            # Points of a hull lie on its surface, and are as far apart as particles should be large.
-            widest = None if start.scene.has_alpha else widths(start.scene, cloud.points, covered)
-            values = first_values(cloud, widest, beyond)
+            shell = 0.0 if self.box is None else self.stage.shell
+            values, covered, extent = fresh_values(start, self.stage, shell, self.beyond)
         self.register_buffer("covered_pixels", torch.tensor(covered))
         self.register_buffer("extent", torch.tensor(extent))
         self.register_buffer("moving_pixels", torch.tensor(moving) if start.shares else None)

@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from forewarp.methods.method import Start
+from forewarp.methods.particles.options import Numbers
 from forewarp.ops.adam import AdamState, adam_rows
 from forewarp.ops.backend import cores, use_numba
 from forewarp.ops.gaussians import (
@@ -186,6 +187,33 @@ def first_values(
     shape["quaternions"] = torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(len(points), 1)
     colors = ((cloud.colors.float() - 0.5) / FLAT)[:, None].clone()
     return {"means": points.clone(), **shape, "opacity": torch.zeros(len(points), 1), "colors": colors}
+
+
+def fresh_values(
+    start: Start, stage: Numbers, shell: float, beyond: Callable[[Tensor], Tensor]
+) -> tuple[dict[str, Tensor], float, float]:
+    """Make the first particles of a fit.
+
+    Args:
+        start, stage: of the method.
+        shell: see ``swept``.
+        beyond: tells which points (N, 3) lie outside the box in which motion is looked for, (N,) bool.
+
+    Returns:
+        their values; how many pixels of an image show anything; and the median distance of what lies within
+        the box from its middle.
+    """
+    scene = start.scene
+    covered = covered_pixels(scene, list(start.frames))
+    count = round(stage.initial_share * stage.final_count(covered, len(scene.train)))
+    cloud = first_points(start, count, shell)
+    outside = beyond(cloud.points)
+    near = cloud.points if bool(outside.all()) else cloud.points[~outside]
+    distances = (near - near.median(0).values).norm(dim=-1)
+    extent = float(distances.median()) or scene.box.diagonal
+    # Points of a hull lie on its surface, and are as far apart as particles should be large.
+    widest = None if scene.has_alpha else widths(scene, cloud.points, covered)
+    return first_values(cloud, widest, outside), covered, extent
 
 
 def measured(scene: Scene, count: int) -> Cloud | None:
