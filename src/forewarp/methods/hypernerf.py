@@ -94,9 +94,8 @@ class HyperNeRF(WarpedMethod):
         code, (octaves, ambient) = self.codes(moment.time), self.windows.tolist()
 
         def encoded(points: Tensor) -> Tensor:
-            beside = positional_encoding(
-                self.slice(points, code), self.ambient_frequencies, window=ambient, identity=False
-            )
+            sliced, count = self.slice(points, code), self.ambient_frequencies
+            beside = positional_encoding(sliced, count, window=ambient, identity=False)
             return torch.cat([self.position(self.warp(points, code, octaves)), beside], -1)
 
         return self.both(encoded, self.direction)

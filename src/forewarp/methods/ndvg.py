@@ -56,12 +56,15 @@ class NDVGStage:
     carry: bool = False
     masked: bool = True
 
-    def checked(self, where: str) -> NDVGStage:
-        """Return this; ``ValueError`` for a number out of range, naming its key in ``where``."""
-        check_number(f"{where}.deformation_voxels", self.deformation_voxels, "a number > 0", lambda n: n > 0)
-        check_number(f"{where}.sink", self.sink, "a number >= 0", lambda fall: fall >= 0)
-        check_number(f"{where}.box_alpha", self.box_alpha, "a number in [0, 1)", lambda part: 0 <= part < 1)
-        return self
+    @classmethod
+    def of(cls, start: Start) -> NDVGStage:
+        """Take a stage's numbers; ``ValueError`` for one that is out of range, naming its key."""
+        made = cls(**{f.name: start.numbers[f.name] for f in fields(cls) if f.name in start.numbers})
+        where = f"stage.{start.stage}"
+        check_number(f"{where}.deformation_voxels", made.deformation_voxels, "a number > 0", lambda n: n > 0)
+        check_number(f"{where}.sink", made.sink, "a number >= 0", lambda fall: fall >= 0)
+        check_number(f"{where}.box_alpha", made.box_alpha, "a number in [0, 1)", lambda part: 0 <= part < 1)
+        return made
 
 
 class NDVG(MarchedMethod):
@@ -97,13 +100,11 @@ class NDVG(MarchedMethod):
     ) -> None:
         tight = start.handover is not None and start.handover.tight
         box = start.handover.box if tight else start.scene.box
-        where = f"stage.{start.stage}"
-        super().__init__(start, marching, box, f"{where}.alpha_init")
+        super().__init__(start, marching, box, f"stage.{start.stage}.alpha_init")
         for key, pair in (("width", width), ("channels", channels)):
             check_value(f"model.{key}", pair, "two whole numbers >= 1", _is_pair)
         check_least(frequencies=frequencies, direction_frequencies=direction_frequencies)
-        given = {f.name: start.numbers[f.name] for f in fields(NDVGStage) if f.name in start.numbers}
-        self.stage = NDVGStage(**given).checked(where)
+        self.stage = NDVGStage.of(start)
         self.shift = density_shift(self.stage.alpha_init, self.alpha_key)
         self.canonical_time = start.scene.canonical_time
         self.octaves, self.continuous = (frequencies, direction_frequencies), continuous

@@ -310,10 +310,8 @@ class NeuralVolumes(RayMethod):
         rgb = near.new_zeros(len(near), 3).index_add(0, row, weights[inside][:, None] * color)
         total = weights.sum(1)
         depth = half * (weights * depths).sum(1) / total.clamp(min=1e-6)
-        rgb, depth, total = (
-            part.new_zeros(len(rays), *part.shape[1:]).index_copy(0, met, part)
-            for part in (rgb, depth, total)
-        )
+        hit = rgb, depth, total
+        rgb, depth, total = (x.new_zeros(len(rays), *x.shape[1:]).index_copy(0, met, x) for x in hit)
         if tint is not None:
             rgb = rgb * tint[0] + tint[1]
         return Rendering(rgb + (1 - total)[:, None] * background.to(rgb), depth, total)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -82,6 +82,10 @@ class DeadStart:
                 f"{self.key}: expected matter somewhere, but got {self.came} in each of {_PATIENCE} steps, "
                 f"which has no gradient: a dead start; {self.advice}"
             )
+
+
+def _named(rendering: Rendering, *names: str) -> Iterator[tuple[str, Tensor]]:
+    return ((name, getattr(rendering, name)) for name in names)
 
 
 class RayMethod(Method):
@@ -300,12 +304,9 @@ class SampledMethod(RayMethod):
         terms = {"photo": lambda: error}
         if "coarse_photo" in self.terms:
             terms["coarse_photo"] = lambda: seen.coarse and (seen.coarse.rgb - rgb).square().mean()
-        return Step(
-            terms | self.extra_terms(seen, batch, generator),
-            error.detach(),
-            {"samples": seen.depths.numel(), "opacity": float(seen.opacity.detach().mean())},
-            tensors=lambda: ((name, getattr(seen, name)) for name in ("density", "weights", "rgb")),
-        )
+        terms |= self.extra_terms(seen, batch, generator)
+        noted = {"samples": seen.depths.numel(), "opacity": float(seen.opacity.detach().mean())}
+        return Step(terms, error.detach(), noted, tensors=lambda: _named(seen, "density", "weights", "rgb"))
 
     def advance(self, progress: float, step: int, optimizer: torch.optim.Optimizer) -> dict[str, float]:
         """See ``Method``; look now and then for where matter is."""
@@ -543,12 +544,9 @@ class MarchedMethod(RayMethod):
             "point_color": lambda: losses.point_color(drawn.weights, drawn.colors, drawn.ray_ids, rgb),
             "background_entropy": lambda: losses.background_entropy(drawn.transmittance),
         }
-        return Step(
-            terms | self.extra_terms(parts[0][0], batch, generator),
-            error.detach(),
-            {"samples": drawn.samples, "opacity": float(drawn.opacity.detach().mean())},
-            tensors=lambda: ((name, getattr(drawn, name)) for name in ("weights", "colors", "rgb")),
-        )
+        terms |= self.extra_terms(parts[0][0], batch, generator)
+        noted = {"samples": drawn.samples, "opacity": float(drawn.opacity.detach().mean())}
+        return Step(terms, error.detach(), noted, tensors=lambda: _named(drawn, "weights", "colors", "rgb"))
 
     def advance(self, progress: float, step: int, optimizer: torch.optim.Optimizer) -> dict[str, float]:
         """See ``Method``; grow, after which optimiser and learning rates start anew; look for matter."""

@@ -83,11 +83,10 @@ class Particles(Queries):
         self.deep, self.chunk = deep, chunk
         if start.weights.get("depth"):
             self.asks = replace(self.asks, sensed=True)
+        train, times = start.scene.train, start.scene.instants
         # Whether a step's images come with planes beside their colours, which the kernels are compiled for.
-        self.has_planes = any(
-            frame.load_valid or (self.asks.sensed and frame.load_sensed) for frame in start.scene.train
-        )
-        self.views, times = len(start.scene.train), start.scene.instants
+        self.has_planes = any(f.load_valid or (self.asks.sensed and f.load_sensed) for f in train)
+        self.views = len(train)
         effects = Effects(**choices).only(self.stage.effects, len(times))
         self.ends = min(times), max(times)
         self.progress = self.decay = self.hidden_decay = 0.0
@@ -109,7 +108,7 @@ class Particles(Queries):
         self.opacity_over_time = _coefficients(values.get("opacity_over_time"), count, opacities)
         lights = exposure.count_of(effects.exposure or 0, start.scene)
         self.exposure = _coefficients(values.get("exposure"), lights, 2, 3) if lights else None
-        self.lit_cameras = frozenset(frame.camera_id for frame in start.scene.train if lights)
+        self.lit_cameras = frozenset(frame.camera_id for frame in train if lights)
         # Of the rounds of density control; the first two are sums since the last round.
         self.register_buffer("gradient_sum", torch.zeros(count))
         self.register_buffer("image_count", torch.zeros(count))  # that showed a particle
@@ -345,9 +344,8 @@ class Particles(Queries):
             gradients["opacity_over_time"] = opacity[:, 1:]
         if nodes is not None:
             rigid = factors.get("rigid", 0.0) * self.stage.rigid_final_factor**self.progress
-            by_motion, terms["rigid"] = pull_nodes(
-                motion, nodes.positions, compared.maps, nodes.edges, nodes.edge_weights, rigid
-            )
+            edges = nodes.edges, nodes.edge_weights
+            by_motion, terms["rigid"] = pull_nodes(motion, nodes.positions, compared.maps, *edges, rigid)
             smooth, extent = factors.get("smooth", 0.0), float(self.extent)
             if "static" in factors:
                 to_rest, terms["static"] = nodes.pull_to_rest(motion, factors["static"], extent)

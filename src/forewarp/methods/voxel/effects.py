@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -302,17 +303,15 @@ class LearnedUpsampler(TrilinearUpsampler):
     def residual(self, features: Tensor, crop: Crop) -> Tensor:
         """Coarse features (1, F, x, y, z) of ``crop`` -> detail (1, 1 + C, x', y', z') of the fine crop."""
         first, second = self.layers
-        parts = (
-            lambda volume: first(interpolate_dense(volume, crop, self.scale)),
-            lambda volume: self.head(second(volume)),
-        )
         volume = self.project(features)  # to few channels first, as all the cost is at the fine resolution
-        for part in parts:
-            if self.recompute:
-                volume = checkpoint(part, volume, use_reentrant=False, preserve_rng_state=False)
-            else:
-                volume = part(volume)
+        volume = self._run(lambda coarse: first(interpolate_dense(coarse, crop, self.scale)), volume)
+        volume = self._run(lambda fine: self.head(second(fine)), volume)
         return volume.to(self.head.weight.dtype)  # half precision ends with the convolutions
+
+    def _run(self, part: Callable[[Tensor], Tensor], volume: Tensor) -> Tensor:
+        if not self.recompute:
+            return part(volume)
+        return checkpoint(part, volume, use_reentrant=False, preserve_rng_state=False)
 
     def forward(self, grid: RadianceGrid) -> RadianceGrid:
         """Up-sample a warped grid without an inpainter: interpolation plus learned detail."""
