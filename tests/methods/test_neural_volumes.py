@@ -77,9 +77,8 @@ def test_opacity_adds_up_along_a_ray(opacity, reached, seed):
 
 def test_priors_at_known_values():
     for opacity, value in ((0.0, 0.0), (1.0, 0.0), (0.5, 1.186)):
-        assert float(neural_volumes.opacity_prior(torch.full((5,), opacity))) == pytest.approx(
-            value, abs=1e-3
-        )
+        prior = neural_volumes.opacity_prior(torch.full((5,), opacity))
+        assert float(prior) == pytest.approx(value, abs=1e-3)
     assert float(neural_volumes.code_prior(torch.zeros(4), torch.zeros(4))) == 0
     assert float(neural_volumes.code_prior(torch.ones(4), torch.zeros(4))) == pytest.approx(0.5)
     assert float(neural_volumes.opacity_variation(torch.full((3, 4, 5), 0.3))) == pytest.approx(1e-5**0.5)

@@ -162,9 +162,8 @@ def test_what_a_stage_left_comes_first_and_random_points_last(scene_of):
 
 
 def values_of(points, widest=None, size=1.0):
-    return start.first_values(
-        Cloud(points, torch.full_like(points, 0.75), torch.ones(len(points)), size), widest
-    )
+    cloud = Cloud(points, torch.full_like(points, 0.75), torch.ones(len(points)), size)
+    return start.first_values(cloud, widest)
 
 
 def test_particles_begin_round_and_no_larger_than_they_are_apart(scene_of):
