@@ -114,8 +114,8 @@ def test_pixels_and_crops_are_parts_of_the_whole_picture(name, dataset, fitted):
     for view in (View(camera, pixels), View(camera, crop=(3, 2, 7, 9))):
         part = found.module.render(view, Moment(0.3), background[view.indices])
         for key in ("rgb", "depth", "opacity"):
-            found, expected = getattr(part, key), getattr(whole, key)[view.indices]
-            torch.testing.assert_close(found, expected, atol=1e-5, rtol=1e-5)
+            expected = getattr(whole, key)[view.indices]
+            torch.testing.assert_close(getattr(part, key), expected, atol=1e-5, rtol=1e-5)
 
 
 @each
