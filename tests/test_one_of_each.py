@@ -65,7 +65,7 @@ def test_nothing_is_written_twice():
         ("cumprod", {"ops/gaussians.py"}),
         # Trilinear reads are ops/grid.py's; Neural Volumes reads volumes with gradients to places; a lens of
         # images is undone before a sweep.
-        ("grid_sample", {"fields/networks.py", "methods/particles/start.py"}),
+        ("grid_sample", {"methods/neural_volumes.py", "methods/particles/start.py"}),
         ("scatter_add_", set()),
     ],
 )

@@ -22,6 +22,7 @@ from forewarp.methods.voxel.effects import (
     StaticBackground,
     UNet3d,
     ViewNetwork,
+    inpaint,
 )
 from forewarp.methods.voxel.forward import ForwardWarp
 from forewarp.methods.voxel.model import VoxelMethod
@@ -270,7 +271,8 @@ def inpaint_work(side: float, dense: bool) -> Work:
     """Run the U-Net and the up-layer on the ball's box, or on the whole lattice, without the warp."""
     method = make_method(int(side), dense, effects=("view_dependence", "upsampler", "inpainter"))
     warped = method.radiance().with_values(method.radiance().values.detach())
-    return backwards(dense, lambda: method._inpaint(warped, None)[0]["inpainted"].values.square().mean())
+    parts = method.inpainter, method.upsampler
+    return backwards(dense, lambda: inpaint(warped, None, *parts)[1].values.square().mean())
 
 
 def render_work(rays: float, dense: bool, step: float = 0.5) -> Work:

@@ -72,10 +72,8 @@ class Conformance:
     def _note(self, item, outcome):
         params = item.callspec.params if hasattr(item, "callspec") else {}
         if "name" in params:
-            outcomes, key = (
-                self.outcomes[item.originalname, params["name"]],
-                (params.get("dataset"), item.nodeid),
-            )
+            outcomes = self.outcomes[item.originalname, params["name"]]
+            key = params.get("dataset"), item.nodeid
             outcomes[key] = min(outcomes.get(key, "passed"), outcome, key=WORST.index)
 
     def pytest_deselected(self, items):

@@ -83,22 +83,16 @@ def calls(of, *names):
     return tuple((of, name) for name in names)
 
 
-VIEW = Effect(
-    {"view_dependence": SphericalHarmonics},
-    calls(SphericalHarmonics, "forward") + calls(ViewNetwork, "forward"),
-)
-BACKGROUND = Effect(
-    {"background": EVERYTHING["background"]}, calls(StaticBackground, "forward") + calls(Together, "density")
-)
+SHADING = calls(SphericalHarmonics, "forward") + calls(ViewNetwork, "forward")
+SPLAT = calls(Motion, "flow", "warp") + calls(TrajectoryField, "coefficients")
+FINER = calls(LearnedUpsampler, "residual", "forward") + calls(TrilinearUpsampler, "forward")
+STILL = calls(StaticBackground, "forward") + calls(Together, "density")
+VIEW = Effect({"view_dependence": SphericalHarmonics}, SHADING)
+BACKGROUND = Effect({"background": EVERYTHING["background"]}, STILL)
 WARP = {
-    "motion": Effect(
-        {"motion": Motion}, calls(Motion, "flow", "warp") + calls(TrajectoryField, "coefficients")
-    ),
+    "motion": Effect({"motion": Motion}, SPLAT),
     "view_dependence": VIEW,
-    "upsampler": Effect(
-        {"upsampler": EVERYTHING["upsampler"]},
-        calls(LearnedUpsampler, "residual", "forward") + calls(TrilinearUpsampler, "forward"),
-    ),
+    "upsampler": Effect({"upsampler": EVERYTHING["upsampler"]}, FINER),
     "inpainter": Effect({"inpainter": INPAINTER}, calls(UNet3d, "features", "residual")),
     "background": BACKGROUND,
 }
@@ -106,8 +100,8 @@ OF_PARTICLES = {
     "motion": Effect({"motion": "spline"}, calls(Nodes, "motion_and_maps", "backward"), ("nodes",)),
     "rotation": Effect({"rotation": True}, (), ("nodes.rotations",)),
     "view_dependence": Effect({"view_dependence": 1}, (), ("sh",)),
-    "color_over_time": Effect({"color_over_time": 1}, calls(Particles, "color_basis")),
-    "opacity_over_time": Effect({"opacity_over_time": 1}, calls(Particles, "opacity_basis")),
+    "color_over_time": Effect({"color_over_time": 1}, ()),
+    "opacity_over_time": Effect({"opacity_over_time": 1}, ()),
     "exposure": Effect({"exposure": 1}, calls(exposure, "gain_and_bias", "lit", "to_unlit")),
     "background": Effect({"background": 0.03}, (), ("resting", "nodes.stopped")),
 }
@@ -121,6 +115,8 @@ SMALL_VOLUMES = {"picture_size": (8, 8), "tower": (8, 16), "features": 16, "code
 SMALL_VOLUMES |= {"decoder": (32, 16, 16, 8), "maps": 4, "warp_side": 6, "warp_width": 16, "weight_width": 8}
 SMALL_VOLUMES |= {"step": 1 / 12, "from_identity": True, "first_opacity": 0.1, "first_deviation": 0.05}
 NETWORK = {"lr": {"network": 2e-3}, "falls": 0.6, "steps": 150}
+PHOTO, SLOW = {"photo": 1.0}, NETWORK | {"slow": True}
+PASSES = PHOTO | {"coarse_photo": 1.0}
 MARCHED = {"photo": 1.0, "point_color": 0.01, "background_entropy": 1e-3, "still": 0.1}
 MARCHING = Marching(jitter=True, occupancy=12)
 
@@ -134,28 +130,18 @@ METHODS = {
         effects={"view_dependence": VIEW, "background": BACKGROUND},
     ),
     "tnerf": Entry(partial(TNeRF, **SMALL_NETWORK, time_frequencies=2), **NETWORK),
-    "nerf": Entry(  # it cannot show what moves
-        partial(NeRF, **SMALL_NETWORK), weights={"photo": 1.0, "coarse_photo": 1.0}, **NETWORK, slow=True
-    ),
+    "nerf": Entry(partial(NeRF, **SMALL_NETWORK), weights=PASSES, **SLOW),  # it cannot show what moves
     "dnerf": Entry(
-        partial(DNeRF, **SMALL_NETWORK, time_frequencies=2),
-        weights={"photo": 1.0, "second_time": 1e-4},
-        **NETWORK,
-        slow=True,
+        partial(DNeRF, **SMALL_NETWORK, time_frequencies=2), weights=PHOTO | {"second_time": 1e-4}, **SLOW
     ),
     "nerfies": Entry(
         partial(Nerfies, **SMALL_NETWORK, **SMALL_WARP, elastic_samples=64),
-        weights={"photo": 1.0, "coarse_photo": 1.0, "elastic": 1e-3, "still": 1e-3},
-        numbers={"warp_in": 0.3},
-        **NETWORK,
-        slow=True,
+        **{"weights": PASSES | {"elastic": 1e-3, "still": 1e-3}, "numbers": {"warp_in": 0.3}} | SLOW,
     ),
     "hypernerf": Entry(
         partial(HyperNeRF, **SMALL_NETWORK, **SMALL_WARP, slice_width=16),
-        weights={"photo": 1.0, "coarse_photo": 1.0, "still": 1e-3},
+        **{"weights": PASSES | {"still": 1e-3}} | SLOW,
         numbers={"warp_in": 0.3, "slice_from": 0.01, "slice_in": 0.2},
-        **NETWORK,
-        slow=True,
     ),
     "tineuvox": Entry(
         partial(TiNeuVox, marching=MARCHING, width=24, position_frequencies=3, camera=True, padded=False),
@@ -182,10 +168,7 @@ METHODS = {
         slow=True,
     ),
     "particles": Entry(
-        partial(
-            Particles,
-            **{name: choice for effect in OF_PARTICLES.values() for name, choice in effect.on.items()},
-        ),
+        partial(Particles, **{k: v for effect in OF_PARTICLES.values() for k, v in effect.on.items()}),
         RATES,
         {"photo": 1.0, "rigid": 3.0, "smooth": 0.1, "static": 0.05},
         {"density_interval": 0.05, "density_until": 0.9}

@@ -29,21 +29,15 @@ def cost(name):
 
 
 each = pytest.mark.parametrize("name", [pytest.param(name, marks=cost(name)) for name in METHODS])
-each_effect = pytest.mark.parametrize(
-    ("name", "effect"), [(n, e) for n in METHODS for e in METHODS[n].effects]
-)
+EFFECTS = [(name, effect) for name in METHODS for effect in METHODS[name].effects]
+each_effect = pytest.mark.parametrize(("name", "effect"), EFFECTS)
 
 
 def on(datasets, first="dnerf"):
     """Every method on every dataset; all but the first dataset are slow."""
-    return pytest.mark.parametrize(
-        ("name", "dataset"),
-        [
-            pytest.param(n, d, marks=cost(n) if d == first else pytest.mark.slow, id=f"{n}-{d}")
-            for n in METHODS
-            for d in datasets
-        ],
-    )
+    pairs = [(n, d, cost(n) if d == first else pytest.mark.slow) for n in METHODS for d in datasets]
+    params = [pytest.param(n, d, marks=marks, id=f"{n}-{d}") for n, d, marks in pairs]
+    return pytest.mark.parametrize(("name", "dataset"), params)
 
 
 def assert_equal_states(one, other):
@@ -120,9 +114,8 @@ def test_pixels_and_crops_are_parts_of_the_whole_picture(name, dataset, fitted):
     for view in (View(camera, pixels), View(camera, crop=(3, 2, 7, 9))):
         part = found.module.render(view, Moment(0.3), background[view.indices])
         for key in ("rgb", "depth", "opacity"):
-            torch.testing.assert_close(
-                getattr(part, key), getattr(whole, key)[view.indices], atol=1e-5, rtol=1e-5
-            )
+            expected = getattr(whole, key)[view.indices]
+            torch.testing.assert_close(getattr(part, key), expected, atol=1e-5, rtol=1e-5)
 
 
 @each

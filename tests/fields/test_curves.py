@@ -45,7 +45,9 @@ def voxels(part=slice(None)):
 def test_everything_stands_still_at_first():
     still = TrajectoryField(BOX, bases=3, frames=8, canonical_time=0.3)
     assert (still.flow(voxels(), 0.9) == 0).all()
-    with pytest.raises(ValueError, match="at least 2 distinct training times, but got 1; use model/motion="):
+    with pytest.raises(
+        ValueError, match="at least 2 distinct training times, but got 1; choose model/motion="
+    ):
         TrajectoryField(BOX, bases=3, frames=1, canonical_time=0.3)
 
 
@@ -103,7 +105,3 @@ def test_curves_of_few_numbers():
     for few in (2, 3, 4):  # as free as there are times
         curve = Curve("spline", 4, few, 0.0, straight=True)
         assert torch.linalg.matrix_rank(curve(torch.linspace(0, 1, few))) == few == curve.count
-    with pytest.raises(ValueError, match="model.motion: expected spline, cosines or none, but got 'fourier'"):
-        Curve("fourier", 8, 20, 0.0)
-    with pytest.raises(ValueError, match="at least 2 distinct training times, but got 1"):
-        Curve("spline", 8, 1, 0.0)

@@ -97,7 +97,10 @@ SKIP = r"width and layers >= 1 and a skip in \[2, layers\] or"
             (partial(Trunk, 5, **({"width": 6, "layers": 4, "skip": 3} | wrong)), SKIP)
             for wrong in ({"skip": 1}, {"skip": 5}, {"layers": 0}, {"width": 0})
         ),
-        (partial(Template, 5, 0), "template: expected condition >= 1 and width >= 2, but got"),
+        (
+            partial(Template, 5, 0, width=8, layers=4, skip=3),
+            "template: expected condition >= 1 and width >= 2, but got",
+        ),
     ],
 )
 def test_refuses(call, text):

@@ -7,7 +7,6 @@ from functools import partial
 import pytest
 import torch
 
-from forewarp.data.module import SceneDataModule
 from forewarp.fields.grids import RadianceGrid
 from forewarp.methods.method import Start
 from forewarp.methods.ndvg import NDVG
@@ -16,12 +15,8 @@ from forewarp.methods.tineuvox import TiNeuVox
 from forewarp.renderer import Renderer
 from forewarp.scene.cloud import Handover
 from forewarp.scene.view import Batch, Moment, View
-from forewarp.training.objective import Objective
-from forewarp.training.schedule import StageSettings
-from forewarp.training.stages import Stage
-from tests.support.sampled_methods import batch
+from tests.support.sampled_methods import batch, psnr_after
 from tests.support.still_cameras import camera, moving_scene, static_ceiling
-from tests.support.tiny_scene import make_run
 
 SMALL = {"tineuvox": {"width": 16, "position_frequencies": 3}, "ndvg": {"width": (16, 16)}}
 KINDS = {"tineuvox": TiNeuVox, "ndvg": NDVG}
@@ -41,9 +36,8 @@ def method(kind, num_voxels=9**3, seed=0, still=None, numbers=None, **options):
 
 
 def rates(made, lr=1.0):
-    return torch.optim.SGD(
-        [{"params": p, "lr": lr, "base_lr": lr, "name": n} for n, p in made.param_groups().items()]
-    )
+    groups = made.param_groups().items()
+    return torch.optim.SGD([{"params": p, "lr": lr, "base_lr": lr, "name": n} for n, p in groups])
 
 
 def some_points(count=200, seed=3, dtype=torch.float32):
@@ -85,9 +79,8 @@ def test_the_camera_changes_colour_only():
     made, points, towards = method("tineuvox", camera=True), some_points(), TOWARDS.expand(200, 3)
     made.cameras = [0, 1]
     fields = [made.field(Moment(0.5, camera=camera)) for camera in (0, 1, None, 7)]
-    density, colors = zip(
-        *((d, color(slice(None), towards)) for d, color in (f.look_up(points) for f in fields))
-    )
+    density, color_of = zip(*(field.look_up(points) for field in fields))
+    colors = [color(slice(None), towards) for color in color_of]
     assert density[0].equal(density[1])
     assert not colors[0].equal(colors[1])
     assert not colors[0].equal(colors[2])
@@ -118,9 +111,8 @@ def test_ndvg_starts_half_hidden_and_unmoved(alpha, opaque):
         offset, mask = field.offset(some_points())
         assert not offset.any()
         assert mask.eq(0.5).all()
-        torch.testing.assert_close(
-            opacity(made, density), torch.full((200,), 0.5 * opaque), rtol=0.01, atol=0
-        )
+        half = torch.full((200,), 0.5 * opaque)
+        torch.testing.assert_close(opacity(made, density), half, rtol=0.01, atol=0)
         pictures.append(made.at(Moment(time)).render(View(camera()), torch.ones(3)).rgb)
     assert pictures[0].equal(pictures[1])
 
@@ -219,10 +211,8 @@ def test_weights_of_offsets_do_not_depend_on_what_is_skipped():
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_dead_start_is_named(kind):
-    alive, dead = (
-        method(kind, 13**3, marching=Marching(color_threshold=threshold), **THICK[kind])
-        for threshold in (1e-3, 0.9)
-    )
+    marchings = (Marching(color_threshold=threshold) for threshold in (1e-3, 0.9))
+    alive, dead = (method(kind, 13**3, marching=marching, **THICK[kind]) for marching in marchings)
     for made, steps in ((alive, 20), (dead, 19)):
         for _ in range(steps):
             made.look(batch(), {}, torch.Generator())
@@ -236,10 +226,8 @@ def test_each_view_of_a_batch_is_seen_by_the_code_of_its_camera():
     made, seen = method("tineuvox", 13**3, camera=True, alpha_init=1e-2), batch().observations[0]
     made.cameras = [0, 1]
     both = [replace(seen, moment=Moment(0.5, camera=i), rgb=seen.rgb / (1 + i)) for i in (0, 1)]
-    steps = [
-        made.look(Batch(tuple(views), 0), {}, torch.Generator().manual_seed(0))
-        for views in (both, both[:1], both[1:])
-    ]
+    batches = [Batch(tuple(views), 0) for views in (both, both[:1], both[1:])]
+    steps = [made.look(of_views, {}, torch.Generator().manual_seed(0)) for of_views in batches]
     for name in ("photo", "point_color", "background_entropy"):
         whole, *alone = (step.terms[name]().detach() for step in steps)
         torch.testing.assert_close(whole, sum(alone) / 2)
@@ -351,11 +339,7 @@ def test_it_learns_what_moves(kind, tmp_path):
     rate = {"grid": 8e-2, "density": 0.1, "color": 0.1, "network": 5e-3}
     rate["deformation"] = 3e-3 if kind == "tineuvox" else 0.1
     lr = {name: rate[name] for name in method(kind).param_groups()}
-    numbers = {"curriculum": {"all_in": 0.0}, "num_voxels": [[0, 9**3], [0.2, 17**3]]}
-    settings = StageSettings.of("fine", lr=lr, iterations=400, **numbers)
     weights = {"photo": 1.0, "point_color": 1e-2, "background_entropy": 1e-3}
-    data = SceneDataModule(moving_scene, rays=96)
     model = partial(KINDS[kind], **SMALL[kind], marching=Marching(jitter=True))
-    module = make_run(tmp_path, [Stage(settings, Objective(weights))], data=data, model=model).fit()
-    psnr = [float(module.psnr_of(target)) for target in data.targets("train")]
-    assert sum(psnr) / len(psnr) > static_ceiling() + 3
+    how = {"lr": lr, "iterations": 400, "num_voxels": [[0, 9**3], [0.2, 17**3]]}
+    assert psnr_after(model, tmp_path, weights, **how) > static_ceiling() + 3

@@ -7,37 +7,26 @@ import pytest
 import torch
 from torch.autograd import gradcheck
 
-from forewarp.data.module import SceneDataModule
-from forewarp.fields.networks import AffineMixture, PictureEncoder, VolumeDecoder, read
+from forewarp.methods import neural_volumes
 from forewarp.methods.method import Start, parameter_count
 from forewarp.methods.neural_volumes import (
+    AffineMixture,
     NeuralVolumes,
+    PictureEncoder,
+    VolumeDecoder,
     Volumes,
-    code_prior,
-    fitted_picture,
-    opacity_prior,
-    opacity_variation,
 )
 from forewarp.scene.camera import Rays
 from forewarp.scene.frame import Frame
 from forewarp.scene.view import Batch, Moment, Observation, View
-from forewarp.training.objective import Objective
-from forewarp.training.schedule import StageSettings
-from forewarp.training.stages import Stage
+from tests.support.sampled_methods import psnr_after
 from tests.support.still_cameras import TIMES, camera, moving_scene, picture, static_ceiling
-from tests.support.tiny_scene import make_run
 
 SMALL = {"picture_size": (16, 16), "tower": (8, 16), "features": 32, "code": 12, "decoder": (32, 16, 16, 8)}
 SMALL |= {"maps": 4, "warp_side": 6, "warp_width": 16, "weight_width": 8, "step": 1 / 16}
 WHITE = torch.ones(3)
-KIND = partial(
-    NeuralVolumes,
-    **SMALL,
-    from_identity=True,
-    first_opacity=0.1,
-    first_deviation=0.05,
-    jitter_in_pictures=False,
-)
+MENDED = {"from_identity": True, "first_opacity": 0.1, "first_deviation": 0.05, "jitter_in_pictures": False}
+KIND = partial(NeuralVolumes, **SMALL, **MENDED)
 WEIGHTS = {"photo": 104.04, "code_prior": 1e-3, "opacity_prior": 1e-2, "opacity_variation": 1e-2}
 
 
@@ -88,17 +77,19 @@ def test_opacity_adds_up_along_a_ray(opacity, reached, seed):
 
 def test_priors_at_known_values():
     for opacity, value in ((0.0, 0.0), (1.0, 0.0), (0.5, 1.186)):
-        assert float(opacity_prior(torch.full((5,), opacity))) == pytest.approx(value, abs=1e-3)
-    assert float(code_prior(torch.zeros(4), torch.zeros(4))) == 0
-    assert float(code_prior(torch.ones(4), torch.zeros(4))) == pytest.approx(0.5)
-    assert float(opacity_variation(torch.full((3, 4, 5), 0.3))) == pytest.approx(1e-5**0.5)
+        prior = neural_volumes.opacity_prior(torch.full((5,), opacity))
+        assert float(prior) == pytest.approx(value, abs=1e-3)
+    assert float(neural_volumes.code_prior(torch.zeros(4), torch.zeros(4))) == 0
+    assert float(neural_volumes.code_prior(torch.ones(4), torch.zeros(4))) == pytest.approx(0.5)
+    assert float(neural_volumes.opacity_variation(torch.full((3, 4, 5), 0.3))) == pytest.approx(1e-5**0.5)
     step = torch.ones(3, 3, 3)
     step[2] = torch.e
-    assert float(opacity_variation(step)) == pytest.approx((1 + 1e-5**0.5) / 2, rel=1e-4)
+    assert float(neural_volumes.opacity_variation(step)) == pytest.approx((1 + 1e-5**0.5) / 2, rel=1e-4)
 
 
-def maps_of(turns=False, **options):
+def maps_of(**options):
     """A warp whose maps do not depend on the code."""
+    options = {"from_identity": False} | options
     warp = AffineMixture(4, maps=3, side=6, width=8, weight_width=8, **options)
     with torch.no_grad():
         for head in (warp.scale, warp.turn, warp.shift):
@@ -132,8 +123,9 @@ def released_deviation(layer, gain):
 def test_first_values_are_the_released_ones():
     torch.manual_seed(0)
     leaky = (2 / 1.04) ** 0.5
-    encoder, decoder = PictureEncoder(1, (32, 32), tower=(16, 32), width=64, code=24), VolumeDecoder(24)
-    warp = AffineMixture(24, maps=16, side=8)
+    encoder = PictureEncoder(1, (32, 32), tower=(16, 32), width=64, code=24)
+    decoder = VolumeDecoder(24, (1024, 512, 512, 256, 256, 128, 128))
+    warp = AffineMixture(24, maps=16, side=8, width=128, weight_width=64, from_identity=False)
     before_leaky = [encoder.towers[0][0], encoder.towers[0][2], encoder.joined, decoder.first]
     before_leaky += [decoder.grow[-2], warp.scale[0], warp.weight[0]]
     last = [encoder.mean, encoder.deviation, decoder.grow[-1], warp.turn[-1], warp.shift[-1], warp.weight[-1]]
@@ -165,7 +157,7 @@ def test_a_volume_is_read_with_x_last_and_points_on_its_corners():
     volume = torch.zeros(1, 3, 4, 5)
     volume[0, 0, 3, 4] = 1.0
     points = torch.tensor([[1.0, 1.0, -1.0], [0.75, 1.0, -1.0], [1.5, 1.0, -1.0]])
-    torch.testing.assert_close(read(volume, points)[:, 0], torch.tensor([1.0, 0.5, 0.0]))
+    torch.testing.assert_close(neural_volumes.read(volume, points)[:, 0], torch.tensor([1.0, 0.5, 0.0]))
 
 
 def test_pictures_are_of_cameras_that_see_every_instant():
@@ -181,7 +173,7 @@ def test_pictures_are_of_cameras_that_see_every_instant():
 def test_a_picture_is_fitted_over_white():
     rgba = torch.zeros(4, 8, 4, dtype=torch.uint8)
     rgba[:, 4:] = torch.tensor([10, 20, 30, 255], dtype=torch.uint8)
-    small = fitted_picture(rgba, (6, 8))
+    small = neural_volumes.fitted_picture(rgba, (6, 8))
     assert (small[:, 1:5, :2] == 255).all()
     assert small[:, 1, 7].tolist() == [10, 20, 30]
     assert (small[:, [0, 5]] == 100).all()  # the mean of pictures, which the encoder reads as 0
@@ -295,17 +287,9 @@ def test_gradients_against_differences():
     def look(code):
         volumes = made.volumes(code)
         seen = made.march(volumes, rays, torch.ones(3).double(), made.tint(0))
-        return seen.rgb.sum(), seen.opacity.sum(), opacity_variation(volumes.template[3])
+        return seen.rgb.sum(), seen.opacity.sum(), neural_volumes.opacity_variation(volumes.template[3])
 
     assert gradcheck(look, [torch.randn(4, dtype=torch.float64, requires_grad=True)])
-
-
-def fitted(tmp_path, scene, steps):
-    settings = StageSettings.of("fine", lr={"network": 5e-3}, iterations=steps, curriculum={"all_in": 0.0})
-    data = SceneDataModule(scene, rays=144)
-    module = make_run(tmp_path, [Stage(settings, Objective(WEIGHTS))], data=data, model=KIND).fit()
-    psnr = [float(module.psnr_of(target)) for target in data.targets("train")]
-    return sum(psnr) / len(psnr)
 
 
 @pytest.mark.slow
@@ -313,9 +297,10 @@ def test_one_view_is_learned_beyond_the_background_alone(tmp_path):
     scene = replace(moving_scene(), train=moving_scene().train[:1])
     truth = scene.train[0].load().double() / 255
     bare = -10 * torch.log10((truth[..., 3:] * (1 - truth[..., :3])).square().mean())
-    assert fitted(tmp_path, lambda: scene, 60) > bare + 3
+    how = {"read": lambda: scene, "rays": 144, "iterations": 60}
+    assert psnr_after(KIND, tmp_path, WEIGHTS, **how) > bare + 3
 
 
 @pytest.mark.slow
 def test_it_learns_what_moves(tmp_path):
-    assert fitted(tmp_path, moving_scene, 300) > static_ceiling() + 3
+    assert psnr_after(KIND, tmp_path, WEIGHTS, rays=144, iterations=300) > static_ceiling() + 3

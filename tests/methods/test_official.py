@@ -44,12 +44,8 @@ MAKE = {
     "tineuvox": partial(TiNeuVox, width=16, camera=True),
     "neural_volumes": partial(NeuralVolumes, **VOLUMES),
 }
-SMALL = (
-    "warp.turn",
-    "warp.shift",
-    "network.6",
-    "offsets.4",
-)  # last layers of warps, which are to move points a little
+# Last layers of warps, which are to move points a little.
+SMALL = ("warp.turn", "warp.shift", "network.6", "offsets.4")
 
 
 def made(kind):
@@ -100,7 +96,7 @@ def of_warp(method):
     strain = method.warp.elastic(seen.coarse.points.reshape(-1, 3), method.codes(0.5), 2.5)
     found["elastic"] = (seen.coarse.weights.reshape(-1) * strain).sum() / len(RAYS)
     if "elastic" in method.terms:  # of a step that had more rays than were looked along
-        term = method.extra_terms(seen, batch(), {}, torch.Generator())["elastic"]()
+        term = method.extra_terms(seen, batch(), torch.Generator())["elastic"]()
         torch.testing.assert_close(term * (144 / len(RAYS)), found["elastic"])
     code = method.codes(0.5)[None]
     return found | {"still": method.warp.stray(POINTS, code, 2.5, None, torch.Generator())}

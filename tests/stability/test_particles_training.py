@@ -9,10 +9,9 @@ import torch
 
 from forewarp.data.module import SceneDataModule
 from forewarp.fields.curves import Curve
-from forewarp.methods.particles import model
+from forewarp.methods.particles import start
 from forewarp.methods.particles.model import Particles
 from forewarp.methods.particles.nodes import Nodes, Skinning
-from forewarp.methods.particles.start import anywhere
 from forewarp.ops.gaussians import BLUR
 from forewarp.scene.box import Box
 from forewarp.scene.camera import Lens
@@ -111,7 +110,7 @@ def test_bad_beginnings_train(tmp_path, monkeypatch, name):
         BAD[name](self)
 
     monkeypatch.setattr(Particles, "__init__", spoiled)
-    monkeypatch.setattr(model, "first_points", lambda start, count, shell: anywhere(start.scene.box, count))
+    monkeypatch.setattr(start, "first_points", lambda of, count, shell: start.anywhere(of.scene.box, count))
     module, losses = fit(tmp_path, SCENE, 8, density_interval=0.2, relink=1)
     assert int(module.method.round) >= 2
     check_sound(module, losses, SCENE, 8)

@@ -17,11 +17,16 @@ EVERY = MOVING | {"color_over_time": 2, "opacity_over_time": 2, "exposure": 1, "
 FACTORS = {"photo": 1.0, "rigid": 3.0, "smooth": 0.1, "static": 0.05}
 
 
-def small_data(frames=6):
-    """The data of a scene of some small images of a moving ball."""
-    data = SceneDataModule(lambda: ball_scene(frames=frames, size=20), rays=1)
+def data_of(scene):
+    """The data of a scene, ready to draw batches."""
+    data = SceneDataModule(lambda: scene, rays=1)
     data.setup("fit")
     return data
+
+
+def small_data(frames=6):
+    """The data of a scene of some small images of a moving ball."""
+    return data_of(ball_scene(frames=frames, size=20))
 
 
 def module_with(data, **changes):

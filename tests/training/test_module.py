@@ -93,7 +93,7 @@ def test_a_step_meets_warm_kernels_only(monkeypatch):
     for model in (tiny.forward_model(), BACKWARD):
         made = module(model)
         made.loss_of(batch())[0].backward()
-        resample(made.method.radiance, tiny.BOX, 500, keep_alpha=1e-2)
+        resample(made.method.radiance, made.method.stage, None, Lattice.of_count(tiny.BOX, 500))
     assert len({name for name, *_ in met}) == 8
     assert met <= warm
 

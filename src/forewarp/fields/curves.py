@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from forewarp.fields.grids import VoxelGrid
 from forewarp.fields.networks import mlp
+from forewarp.ops.backend import check_value
 from forewarp.ops.curves import dct_basis, spline_basis, spline_shares
 from forewarp.ops.encode import positional_encoding
 from forewarp.ops.grid import corner_weights, index_of, trilinear
@@ -24,29 +25,20 @@ class Curve:
     time bend their own knots, and not what all others share.
 
     Args:
-        kind: ``spline``, whose knots bend their neighbourhood in time alone, or ``cosines``, the paper's DCT.
+        kind: of ``KINDS``: ``spline``, whose knots bend their neighbourhood in time alone, or ``cosines``,
+            the paper's DCT.
         count: of coefficients; a spline has at least 4, cosines at most one less than there are times. Of a
             ``straight`` spline two follow from the others, and it has two less, but no fewer than 4 of four
             times or more, and as many as there are times of fewer.
-        times: how many distinct training times there are.
+        times: how many distinct training times there are, at least 2.
         canonical_time: in [0, 1].
         straight: whether a spline ends without acceleration: what the first and the last picture leave open
             is then told by those beside them.
-
-    Raises:
-        ValueError: for another kind, or a single time, over which nothing moves.
     """
 
     def __init__(
         self, kind: str, count: int, times: int, canonical_time: float, *, straight: bool = False
     ) -> None:
-        if kind not in KINDS:
-            raise ValueError(f"model.motion: expected {', '.join(KINDS)} or none, but got {kind!r}")
-        if times < 2:
-            raise ValueError(
-                f"model.motion: expected at least 2 distinct training times, but got {times}; "
-                "use model.motion=none"
-            )
         self.kind, self.times, self.canonical_time = kind, times, canonical_time
         self.straight = straight and kind == "spline"
         if kind == "cosines":
@@ -129,11 +121,8 @@ class TrajectoryField(nn.Module):
         padding: float = 0.0,
     ) -> None:
         super().__init__()
-        if frames < 2:
-            raise ValueError(
-                f"model.motion: expected at least 2 distinct training times, but got {frames}; "
-                "use model/motion=none"
-            )
+        wanted = "at least 2 distinct training times"
+        check_value("model.motion", frames, wanted, lambda count: count >= 2, "choose model/motion=none")
         self.box, self.frames, self.canonical_time = box, frames, canonical_time
         self.bases = min(bases, frames - 1)
         self.scale = 0.5 * max(box.size)

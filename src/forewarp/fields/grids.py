@@ -12,6 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from forewarp.fields.networks import mlp
+from forewarp.ops.backend import check_value, is_number
 from forewarp.ops.encode import encoded_size, positional_encoding
 from forewarp.ops.grid import index_of, occupied_cells, trilinear
 from forewarp.scene.box import Box, Lattice
@@ -65,11 +66,8 @@ class Activation:
     density_scale: float
 
     def __post_init__(self) -> None:
-        if not 0 < self.density_scale < float("inf"):
-            raise ValueError(
-                f"density_scale: expected a length > 0 from the stage before, but got {self.density_scale}; "
-                "delete the folder of that stage"
-            )
+        wanted, anew = "a length > 0 from the stage before", "delete the folder of that stage"
+        check_value("density_scale", self.density_scale, wanted, lambda scale: 0 < scale < math.inf, anew)
 
     def sigma(self, raw: Tensor) -> Tensor:
         """Return the density per world unit of length, in the shape of ``raw``."""
@@ -154,7 +152,8 @@ class VoxelGrid(nn.Module):
     """Parameters (N, C) with one row per active voxel, and buffers with the voxels' positions.
 
     ``voxels`` (N, 3) are the active voxels' lattice positions, ``index`` (X, Y, Z) their rows or -1. Both
-    change during training (``activate``, ``resample``), so loading adopts a checkpoint's lattice and shapes.
+    change during training (``activate``, ``resample``), so a method that loads adopts a checkpoint's lattice
+    and shapes, those of ``grows``.
 
     Args:
         lattice: possible voxel positions.
@@ -162,10 +161,13 @@ class VoxelGrid(nn.Module):
         channels: number of channels C by parameter name.
     """
 
+    loose = ("index",)
+
     def __init__(self, lattice: Lattice, active: Tensor, channels: dict[str, int]) -> None:
         super().__init__()
         self.lattice = lattice
         self.names = tuple(channels)
+        self.grows = ("voxels", "index", *channels)
         voxels = active.nonzero()
         self.register_buffer("voxels", voxels)
         self.register_buffer("index", index_of(voxels, lattice.shape))
@@ -262,42 +264,16 @@ class VoxelGrid(nn.Module):
         try:
             lattice = _lattice(state[prefix + "_extra_state"])
         except (KeyError, TypeError, ValueError, OverflowError):
-            return "_extra_state"
-        voxels, index = (state.get(prefix + name) for name in ("voxels", "index"))
-        if not _is(voxels, torch.int64) or voxels.ndim != 2 or voxels.shape[1] != 3:
-            return "voxels"
+            return f"{prefix}_extra_state"
+        voxels, index = (state[prefix + name] for name in ("voxels", "index"))
         if not bool(lattice.holds(voxels).all()):
-            return "voxels"
-        if (
-            not _is(index, torch.int32) or tuple(index.shape) != lattice.shape
-        ):  # before one is made of a shape
-            return "index"
-        if not torch.equal(index, index_of(voxels, lattice.shape)):
-            return "index"
-        for name in self.names:
-            values, own = state.get(prefix + name), self.parameter(name)
-            good = torch.is_tensor(values) and values.is_floating_point()
-            if not good or tuple(values.shape) != (len(voxels), own.shape[1]):
-                return name
-        return None
-
-    def _load_from_state_dict(self, state_dict, prefix, *args, **kwargs) -> None:
-        for name in ("voxels", "index"):
-            if prefix + name in state_dict:
-                setattr(self, name, torch.empty_like(state_dict[prefix + name]))
-        for name in self.names:
-            if prefix + name in state_dict:
-                p = self.parameter(name)
-                p.data = p.data.new_empty(state_dict[prefix + name].shape)
-        super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
+            return f"{prefix}voxels"
+        fits = index.shape == lattice.shape  # before one is made of a shape
+        return None if fits and torch.equal(index, index_of(voxels, lattice.shape)) else f"{prefix}index"
 
 
 def _lattice(state: dict) -> Lattice:
     return Lattice(Box(tuple(state["low"]), tuple(state["high"])), tuple(state["shape"]))
-
-
-def _is(value: object, dtype: torch.dtype) -> bool:
-    return torch.is_tensor(value) and value.dtype == dtype
 
 
 def density_shift(alpha_init: float, key: str = "model.radiance.alpha_init") -> float:
@@ -309,8 +285,7 @@ def density_shift(alpha_init: float, key: str = "model.radiance.alpha_init") -> 
     >>> round(density_shift(0.5), 6)
     0.0
     """
-    if not isinstance(alpha_init, int | float) or not 0 < alpha_init < 1:
-        raise ValueError(f"{key}: expected a number in (0, 1), but got {alpha_init}")
+    check_value(key, alpha_init, "a number in (0, 1)", lambda alpha: is_number(alpha) and 0 < alpha < 1)
     return math.log(1 / (1 - alpha_init) - 1)
 
 
@@ -354,11 +329,12 @@ class CanonicalRadiance(VoxelGrid):
 
     def births(self, alpha: float) -> dict[str, float]:
         """Return the values of new voxels of an opacity by parameter; others get their neighbours' mean."""
-        return {}
+        density = {"density": self.activation.raw(alpha, self.lattice.voxel_size)}
+        return density if "density" in self.names else {}
 
     def empties(self) -> dict[str, float]:
         """Return the values of absent voxels by parameter, for resampling; others do not count them."""
-        return {}
+        return {"density": EMPTY} if "density" in self.names else {}
 
 
 class DirectRadiance(CanonicalRadiance):
@@ -384,15 +360,7 @@ class DirectRadiance(CanonicalRadiance):
     @torch.no_grad()
     def fill(self, alpha: float) -> None:
         """See ``CanonicalRadiance``."""
-        self.density.fill_(self.activation.raw(alpha, self.lattice.voxel_size))
-
-    def births(self, alpha: float) -> dict[str, float]:
-        """Return the density of an opacity; colour is averaged."""
-        return {"density": self.activation.raw(alpha, self.lattice.voxel_size)}
-
-    def empties(self) -> dict[str, float]:
-        """Return the density of absent voxels; colour is averaged."""
-        return {"density": EMPTY}
+        self.density.fill_(self.births(alpha)["density"])
 
 
 class FeatureRadiance(CanonicalRadiance):
@@ -478,10 +446,9 @@ def _indices(grid: VoxelGrid, strides: tuple[int, ...], padded: bool) -> tuple[T
     known = getattr(grid, "_strided", None)
     if known is None or known[0] is not grid.index or known[1] != (strides, padded):
         missing = [(1 - n) % strides[-1] for n in grid.index.shape]
-        if any(missing) and not padded:
-            raise ValueError(
-                f"a strided grid: expected sizes of {strides[-1]} k + 1, but got {tuple(grid.index.shape)}"
-            )
+        if not padded:
+            wanted, shape = f"sizes of {strides[-1]} k + 1", tuple(grid.index.shape)
+            check_value("a strided grid", shape, wanted, lambda _: not any(missing))
         ends = [end for more in reversed(missing) for end in (0, more)]
         index = torch.nn.functional.pad(grid.index, ends, value=-1)
         known = grid.index, (strides, padded), (index, [index[::s, ::s, ::s].contiguous() for s in strides])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from bisect import bisect_left
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from functools import lru_cache
@@ -12,6 +11,7 @@ import torch
 from torch import Tensor
 
 from forewarp.fields.curves import Curve
+from forewarp.fields.networks import beside
 from forewarp.ops.gaussians import (
     CHUNK,
     COLUMN,
@@ -52,20 +52,13 @@ def pinhole_of(camera: Camera, blur: float) -> Pinhole:
         blur: square pixels added to the variance of every splat.
     """
     pose, lens = camera.camera_to_world.double(), camera.lens
-    return Pinhole(
-        tuple(pose[:3, :3].T.flatten().tolist()),
-        tuple(pose[:3, 3].tolist()),
-        (camera.fx, camera.fy),
-        (camera.cx, camera.cy),
-        (camera.width, camera.height),
-        max(_NEAR * camera.near, _LEAST_NEAR * camera.far),
-        skew=camera.skew,
-        blur=blur,
-        margin=MARGIN * max(camera.width, camera.height),
-        radial=(0.0, 0.0, 0.0) if lens is None else lens.k,
-        tangential=(0.0, 0.0) if lens is None else lens.p,
-        reach=1e8 if lens is None else _squared_reach(camera),
-    )
+    rotation, center = tuple(pose[:3, :3].T.flatten().tolist()), tuple(pose[:3, 3].tolist())
+    focal, middle, size = (camera.fx, camera.fy), (camera.cx, camera.cy), (camera.width, camera.height)
+    near = max(_NEAR * camera.near, _LEAST_NEAR * camera.far)
+    others = {"skew": camera.skew, "blur": blur, "margin": MARGIN * max(size)}
+    if lens is not None:
+        others |= {"radial": lens.k, "tangential": lens.p, "reach": _squared_reach(camera)}
+    return Pinhole(rotation, center, focal, middle, size, near, **others)
 
 
 def _squared_reach(camera: Camera) -> float:
@@ -85,9 +78,8 @@ def _squared_reach(camera: Camera) -> float:
 
 def cosines(count: int, time: float, canonical_time: float) -> list[float]:
     """Return ``cos(pi k t) - cos(pi k t_c)`` for k = 1 .. count: 0 at the canonical time."""
-    return [
-        math.cos(math.pi * k * time) - math.cos(math.pi * k * canonical_time) for k in range(1, count + 1)
-    ]
+    rates = [math.pi * k for k in range(1, count + 1)]
+    return [math.cos(rate * time) - math.cos(rate * canonical_time) for rate in rates]
 
 
 def around(times: Sequence[float], time: float) -> dict[int, float]:
@@ -96,12 +88,8 @@ def around(times: Sequence[float], time: float) -> dict[int, float]:
     >>> around([0.0, 0.5, 1.0], 0.625), around([0.0, 0.5, 1.0], 1.5)
     ({1: 0.75, 2: 0.25}, {2: 1.0})
     """
-    after = bisect_left(times, time)
-    if after in (0, len(times)):
-        return {min(after, len(times) - 1): 1.0}
-    low, high = times[after - 1 : after + 1]
-    share = (time - low) / (high - low)
-    return {row: part for row, part in ((after - 1, 1 - share), (after, share)) if part > 0}
+    before, after, share = beside(times, time)
+    return {before: 1.0} if before == after else {before: 1 - share, after: share}
 
 
 @dataclass(eq=False)
@@ -283,12 +271,9 @@ class MovingGaussians:
 
     def gaussians(self) -> Gaussians:
         """Return them as the operators read them: coefficients of one kind in one tensor."""
-        opacity, colors = [self.opacity[:, None]], [self.harmonics]
-        opacity += [] if self.opacity_over_time is None else [self.opacity_over_time]
-        colors += [] if self.color_over_time is None else [self.color_over_time]
-        return Gaussians(
-            self.means, self.log_scales, self.quaternions, torch.cat(opacity, -1), torch.cat(colors, 1)
-        )
+        kinds = (self.opacity[:, None], self.opacity_over_time), (self.harmonics, self.color_over_time)
+        opacity, colors = (torch.cat([p for p in parts if p is not None], 1) for parts in kinds)
+        return Gaussians(self.means, self.log_scales, self.quaternions, opacity, colors)
 
     def warp(self, time: float) -> Warp:
         """Return how all of them move from the canonical state to a time."""

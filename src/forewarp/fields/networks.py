@@ -1,18 +1,15 @@
-"""Networks that several methods learn: perceptrons, NeRF's trunk and template, codes, screws, volumes."""
+"""Networks that several methods learn: perceptrons, NeRF's trunk and template, codes, screws."""
 
 from __future__ import annotations
 
 import bisect
 import math
 from collections.abc import Sequence, Set
-from functools import partial
 
 import torch
 from torch import Tensor, nn
-from torch.nn import functional
 
 from forewarp.ops.encode import encoded_size, positional_encoding
-from forewarp.ops.gaussians import rotations
 from forewarp.ops.nodes import geman_mcclure, move_by_screw, stretch
 
 
@@ -69,32 +66,22 @@ class Trunk(nn.Module):
         besides: channels that only the first layer reads, not the skip.
         glorot: start from Glorot's uniform weights and biases of 0, as JAX versions do; False: PyTorch's.
 
-    >>> sum(p.numel() for p in Trunk(72).parameters())
+    >>> sum(p.numel() for p in Trunk(72, width=256, layers=8, skip=6).parameters())
     497664
     """
 
     def __init__(
-        self,
-        inputs: int,
-        *,
-        width: int = 256,
-        layers: int = 8,
-        skip: int | None = 6,
-        besides: int = 0,
-        glorot: bool = False,
+        self, inputs: int, *, width: int, layers: int, skip: int | None, besides: int = 0, glorot=False
     ) -> None:
         super().__init__()
         if min(inputs, width, layers) < 1 or not (skip is None or 2 <= skip <= layers):
-            raise ValueError(
-                "trunk: expected inputs, width and layers >= 1 and a skip in [2, layers] or null, "
-                f"but got {inputs=}, {width=}, {layers=}, {skip=}"
-            )
+            wanted = "inputs, width and layers >= 1 and a skip in [2, layers] or null"
+            raise ValueError(f"trunk: expected {wanted}, but got {inputs=}, {width=}, {layers=}, {skip=}")
         self.skip = skip
         sizes = [inputs + besides, *[width] * (layers - 1)]
         self.layers = nn.ModuleList(
             nn.Linear(size + (inputs if number == skip else 0), width) for number, size in enumerate(sizes, 1)
         )
-
         if glorot:
             self.apply(start_as_glorot)
 
@@ -117,28 +104,19 @@ class Template(nn.Module):
     Args:
         inputs: channels of the encoded point.
         condition: channels that only colour depends on.
-        width, layers, skip, glorot: see ``Trunk``.
+        width, glorot: see ``Trunk``, of all layers.
+        trunk: layers and skip, see ``Trunk``.
 
-    >>> sum(p.numel() for p in Template(63, 27).parameters())
+    >>> sum(p.numel() for p in Template(63, 27, width=256, layers=8, skip=6).parameters())
     595844
     """
 
-    def __init__(
-        self,
-        inputs: int,
-        condition: int,
-        *,
-        width: int = 256,
-        layers: int = 8,
-        skip: int | None = 6,
-        glorot: bool = False,
-    ) -> None:
+    def __init__(self, inputs: int, condition: int, *, width: int, glorot: bool = False, **trunk) -> None:
         super().__init__()
         if condition < 1 or width < 2:
-            raise ValueError(
-                f"template: expected condition >= 1 and width >= 2, but got {condition=}, {width=}"
-            )
-        self.trunk = Trunk(inputs, width=width, layers=layers, skip=skip)
+            wanted = "condition >= 1 and width >= 2"
+            raise ValueError(f"template: expected {wanted}, but got {condition=}, {width=}")
+        self.trunk = Trunk(inputs, width=width, **trunk)
         self.density_head = nn.Linear(width, 1)
         self.bottleneck = nn.Linear(width, width)
         self.shading = nn.Linear(width + condition, width // 2)
@@ -244,19 +222,16 @@ class ScrewWarp(nn.Module):
     Args:
         code_size: channels of a code.
         frequencies: octaves of the points' encoding.
-        width, layers, skip: see ``Trunk``.
+        width, trunk: width, layers and skip, see ``Trunk``.
 
-    >>> sum(p.numel() for p in ScrewWarp(8).parameters())
+    >>> sum(p.numel() for p in ScrewWarp(8, frequencies=6, width=128, layers=6, skip=5).parameters())
     95494
     """
 
-    def __init__(
-        self, code_size: int, *, frequencies: int = 6, width: int = 128, layers: int = 6, skip: int | None = 5
-    ) -> None:
+    def __init__(self, code_size: int, *, frequencies: int, width: int, **trunk) -> None:
         super().__init__()
         self.frequencies = frequencies
-        inputs = encoded_size(3, frequencies) + code_size
-        self.trunk = Trunk(inputs, width=width, layers=layers, skip=skip, glorot=True)
+        self.trunk = Trunk(encoded_size(3, frequencies) + code_size, width=width, **trunk, glorot=True)
         self.turn, self.shift = nn.Linear(width, 3), nn.Linear(width, 3)
         for head in (self.turn, self.shift):
             nn.init.uniform_(head.weight, 0, _FIRST)
@@ -308,151 +283,3 @@ def drawn(rows: Tensor, count: int | None, generator: torch.Generator) -> Tensor
     if count is None or len(rows) <= count:
         return rows
     return rows[torch.randperm(len(rows), generator=generator)[:count].to(rows.device)]
-
-
-DEVIATION_SCALE = 0.01  # of the layer that gives the logarithm of the deviation
-_SLOPE = 0.2  # of leaky ReLUs
-_LEAST = 1e-3  # least total weight of the maps at a point
-_SHORT = 1e-5  # added to the squared length of a quaternion
-_start_leaky = partial(start_as_glorot, gain=nn.init.calculate_gain("leaky_relu", _SLOPE))
-
-
-class PictureEncoder(nn.Module):
-    """Pictures of an instant (K, 3, H, W) -> mean and logarithm of the deviation of a code, (C,) each.
-
-    Args:
-        pictures: K, each with convolutions of its own.
-        size: H and W, multiples of ``2**len(tower)``.
-        tower: channels of the convolutions (4 x 4, stride 2).
-        width: channels of the layer that joins the pictures.
-        code: C.
-    """
-
-    def __init__(
-        self,
-        pictures: int,
-        size: tuple[int, int],
-        *,
-        tower: Sequence[int] = (64, 64, 128, 128, 256, 256, 256),
-        width: int = 512,
-        code: int = 256,
-    ) -> None:
-        super().__init__()
-        by = 2 ** len(tower)
-        if len(size) != 2 or min(size) < by or any(side % by for side in size):
-            raise ValueError(
-                f"model.picture_size: expected height and width in multiples of {by}, as the tower halves "
-                f"{len(tower)} times, but got {list(size)}"
-            )
-        steps = list(zip((3, *tower[:-1]), tower))
-        self.towers = nn.ModuleList(
-            nn.Sequential(
-                *(part for i, o in steps for part in (nn.Conv2d(i, o, 4, 2, 1), nn.LeakyReLU(_SLOPE)))
-            )
-            for _ in range(pictures)
-        )
-        self.joined = nn.Linear(pictures * tower[-1] * (size[0] // by) * (size[1] // by), width)
-        self.mean, self.deviation = nn.Linear(width, code), nn.Linear(width, code)
-        self.apply(_start_leaky)
-        for last in (self.mean, self.deviation):
-            start_as_glorot(last)
-
-    def forward(self, pictures: Tensor) -> tuple[Tensor, Tensor]:
-        """See the class."""
-        seen = [tower(one[None]).flatten() for tower, one in zip(self.towers, pictures, strict=True)]
-        hidden = functional.leaky_relu(self.joined(torch.cat(seen)), _SLOPE)
-        return 0.1 * self.mean(hidden), DEVIATION_SCALE * self.deviation(hidden)
-
-
-class VolumeDecoder(nn.Module):
-    """A code (C,) -> raw values (4, S, S, S), S = ``2**len(channels)``: three of colour, then opacity."""
-
-    def __init__(
-        self, code: int, channels: Sequence[int] = (1024, 512, 512, 256, 256, 128, 128), out: int = 4
-    ) -> None:
-        super().__init__()
-        self.first = nn.Linear(code, channels[0])
-        self.grow = nn.ModuleList(
-            nn.ConvTranspose3d(i, o, 4, 2, 1) for i, o in zip(channels, (*channels[1:], out))
-        )
-        self.apply(_start_leaky)
-        start_as_glorot(self.grow[-1])
-
-    def forward(self, code: Tensor) -> Tensor:
-        """See the class."""
-        volume = self.first(code).reshape(1, -1, 1, 1, 1)
-        for layer in self.grow:
-            volume = layer(functional.leaky_relu(volume, _SLOPE))
-        return volume[0]
-
-
-class AffineMixture(nn.Module):
-    """An inverse warp: ``W(x) = sum_i g_i(A_i x) A_i x / max(sum_i g_i(A_i x), 0.001)`` with affine maps
-    ``A_i x = s_i * R_i (x - t_i)`` and decoded weights ``g_i`` on a lattice, beyond which they are as at its
-    border.
-
-    Args:
-        code: C.
-        maps: their number.
-        side: lattice points along an axis of the weights and of W.
-        width, weight_width: hidden channels of the maps and of the weights.
-        from_identity: add 1 to ``s`` and the identity to ``R``, so that W is near the identity where codes
-            are small. As released, scales of either sign and any rotations are mixed at first.
-    """
-
-    def __init__(
-        self,
-        code: int,
-        *,
-        maps: int = 16,
-        side: int = 32,
-        width: int = 128,
-        weight_width: int = 64,
-        from_identity: bool = False,
-    ) -> None:
-        super().__init__()
-        self.maps, self.side, self.from_identity = maps, side, from_identity
-
-        def head(hidden: int, out: int) -> nn.Sequential:
-            return nn.Sequential(nn.Linear(code, hidden), nn.LeakyReLU(_SLOPE), nn.Linear(hidden, out))
-
-        self.scale, self.turn, self.shift = (head(width, maps * size) for size in (3, 4, 3))
-        self.weight = head(weight_width, maps * side**3)
-        self.apply(_start_leaky)
-        for branch in (self.scale, self.turn, self.shift, self.weight):
-            start_as_glorot(branch[-1])
-        axis = torch.linspace(-1, 1, side)
-        z, y, x = torch.meshgrid(axis, axis, axis, indexing="ij")
-        self.register_buffer("lattice", torch.stack([x, y, z], -1), persistent=False)
-
-    def moved(self, code: Tensor, points: Tensor) -> Tensor:
-        """Apply each map to points (..., 3): (M, ..., 3)."""
-        scale = self.scale(code).reshape(self.maps, 3)
-        turn = self.turn(code).reshape(self.maps, 4)
-        shift = 0.1 * self.shift(code).reshape(self.maps, 3)
-        if self.from_identity:
-            scale = 1 + scale
-            turn = turn + turn.new_tensor([1.0, 0.0, 0.0, 0.0])
-        squared, eye = turn.square().sum(-1)[:, None, None], torch.eye(3).to(turn)
-        rotation = eye + (rotations(turn) - eye) * squared / (squared + _SHORT)  # smooth also where turn is 0
-        flat = points.reshape(-1, 3) - shift[:, None]
-        found = scale[:, None] * (flat @ rotation.mT)
-        return found.reshape(self.maps, *points.shape)
-
-    def forward(self, code: Tensor) -> Tensor:
-        """Code (C,) -> W at the lattice's points (3, S, S, S)."""
-        places = self.moved(code, self.lattice)
-        weights = self.weight(code).exp().reshape(self.maps, 1, *[self.side] * 3)
-        weights = functional.grid_sample(weights, places, padding_mode="border", align_corners=True)
-        weights = weights[:, 0, ..., None]
-        whole = (weights * places).sum(0) / weights.sum(0).clamp(min=_LEAST)
-        return whole.permute(3, 0, 1, 2)
-
-
-def read(volume: Tensor, points: Tensor, padding: str = "zeros") -> Tensor:
-    """Read a volume (C, S, S, S) at points (N, 3) of the cube, trilinearly: (N, C).
-
-    Beyond the cube lies 0, or with padding ``border`` what is nearest.
-    """
-    at = points.reshape(1, 1, 1, -1, 3)
-    return functional.grid_sample(volume[None], at, padding_mode=padding, align_corners=True)[0, :, 0, 0].T

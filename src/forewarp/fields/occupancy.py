@@ -7,9 +7,11 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor, nn
 
+from forewarp.ops.grid import dilate
 from forewarp.scene.box import Box
 from forewarp.scene.frame import Frame, sightings
 
+_EVERY = 4  # possible cell is evaluated by a look
 _FADE = 0.8  # of what was found, at each look
 _OPAQUE = 0.01  # a cell counts as occupied if a step of one cell through it is at least so opaque,
 _AT_ONCE = 1 << 16  # cells evaluated at once
@@ -20,18 +22,17 @@ class Occupancy(nn.Module):
     """A lattice of side^3 cells over a box: the largest density found in each of them of late, at any time.
 
     Until it has looked ``patience`` times every possible cell counts as occupied. A look evaluates every
-    n-th of these, at a random point of each and at a random time.
+    fourth of these, at a random point of each and at a random time.
 
     Args:
         box: of the scene; what lies outside is empty.
         side: cells along each axis.
-        part: share of the possible cells that a look evaluates.
         patience: looks before any cell may count as empty.
     """
 
-    def __init__(self, box: Box, *, side: int = 64, part: float = 0.25, patience: int = 8) -> None:
+    def __init__(self, box: Box, *, side: int, patience: int = 8) -> None:
         super().__init__()
-        self.side, self.part, self.patience = side, part, patience
+        self.side, self.patience = side, patience
         self.register_buffer("low", torch.tensor(box.low))
         self.register_buffer("cell", torch.tensor(box.size) / side)
         self.register_buffer("density", torch.zeros(side**3))
@@ -68,9 +69,8 @@ class Occupancy(nn.Module):
             times: one is drawn.
             generator: draws cells, points and time.
         """
-        step = max(1, round(1 / self.part))
-        first = int(torch.randint(step, (), generator=generator))
-        cells = self.possible.nonzero()[first::step, 0]
+        first = int(torch.randint(_EVERY, (), generator=generator))
+        cells = self.possible.nonzero()[first::_EVERY, 0]
         inside = torch.rand(len(cells), 3, generator=generator).to(self.low)
         time = times[int(torch.randint(len(times), (), generator=generator))]
         found = density(self.low + (self._rows(cells) + inside) * self.cell, time)
@@ -123,8 +123,7 @@ class Occupancy(nn.Module):
 
     def _grown(self, occupied: Tensor) -> Tensor:
         """Add the cells beside occupied ones: what moves, moves into them."""
-        volume = occupied.reshape(1, 1, *[self.side] * 3).to(torch.float32)
-        return nn.functional.max_pool3d(volume, 3, 1, 1).flatten() > 0
+        return dilate(occupied.reshape([self.side] * 3)).flatten()
 
     def forward(self, points: Tensor) -> Tensor:
         """Tell which of the world points (..., 3) lie in an occupied cell: bool (...,)."""

@@ -15,6 +15,8 @@ from forewarp.scene.brief import brief
 from forewarp.scene.cloud import Ellipsoids
 from forewarp.scene.view import Moment, Rendering, View
 
+# What has a row for each Gaussian; the last two may be None.
+ROWS = ("means", "log_scales", "quaternions", "opacity", "harmonics", "color_over_time", "opacity_over_time")
 _NEXT = 1e-5  # of all time: numbers are rounded
 
 
@@ -82,9 +84,8 @@ class MovingWindows:
 
     def to(self, device: torch.device | str) -> MovingWindows:
         """Move all tensors to a device."""
-        return replace(
-            self, windows=tuple(replace(w, gaussians=w.gaussians.to(device)) for w in self.windows)
-        )
+        moved = (replace(window, gaussians=window.gaussians.to(device)) for window in self.windows)
+        return replace(self, windows=tuple(moved))
 
     def number(self, time: float) -> int:
         """Return the number of the window that a time of the film is of."""
@@ -115,13 +116,8 @@ class MovingWindows:
 
 def with_shared(own: MovingGaussians, still: MovingGaussians) -> MovingGaussians:
     """Return Gaussians, and after them others that stand ``still``, of as many coefficients."""
-
-    def rows(name: str) -> Tensor | None:
-        parts = [getattr(part, name) for part in (own, still)]
-        return None if parts[0] is None else torch.cat(parts)
-
-    names = ("means", "log_scales", "quaternions", "opacity", "harmonics")
-    parts = {name: rows(name) for name in (*names, "color_over_time", "opacity_over_time")}
+    names = [name for name in ROWS if getattr(own, name) is not None]
+    parts = {name: torch.cat([getattr(own, name), getattr(still, name)]) for name in names}
     motion = own.motion
     if motion is not None:
         none = motion.weights.new_zeros(len(still.means), motion.weights.shape[1])
@@ -132,12 +128,8 @@ def with_shared(own: MovingGaussians, still: MovingGaussians) -> MovingGaussians
 
 def taken(gaussians: MovingGaussians, rows: Tensor) -> MovingGaussians:
     """Return some rows of Gaussians, which follow no nodes."""
-    names = ("means", "log_scales", "quaternions", "opacity", "harmonics")
-    parts = {name: getattr(gaussians, name)[rows] for name in names}
-    for name in ("color_over_time", "opacity_over_time"):
-        value = getattr(gaussians, name)
-        parts[name] = None if value is None else value[rows]
-    return replace(gaussians, **parts, motion=None)
+    names = [name for name in ROWS if getattr(gaussians, name) is not None]
+    return replace(gaussians, **{name: getattr(gaussians, name)[rows] for name in names}, motion=None)
 
 
 def check_windows(begins: Sequence[float], spans: Sequence[Sequence[float]], fade: float) -> None:
@@ -152,11 +144,9 @@ def check_windows(begins: Sequence[float], spans: Sequence[Sequence[float]], fad
     shown = [(max(begin - fade, 0.0), min(end + fade, 1.0)) for begin, end in zip(begins, ends)]
     within = all(a - _NEXT <= begin and end <= b + _NEXT for (a, b), (begin, end) in zip(spans, shown))
     if not rise or not within:
-        raise ValueError(
-            "windows: expected windows that begin at 0 and follow one another, each shown within its span, "
-            "but got "
-            + ", ".join(f"{begin:g} in [{a:g}, {b:g}]" for begin, (a, b) in zip(begins, spans))[:200]
-        )
+        wanted = "windows that begin at 0 and follow one another, each shown within its span"
+        came = ", ".join(f"{begin:g} in [{a:g}, {b:g}]" for begin, (a, b) in zip(begins, spans))
+        raise ValueError(f"windows: expected {wanted}, but got {came[:200]}")
 
 
 def longest_fade(begins: Sequence[float], spans: Sequence[Sequence[float]]) -> float:

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-
 import torch
 from torch import Tensor, nn
 
 from forewarp.fields.networks import Template, Trunk
 from forewarp.methods.method import Start
-from forewarp.methods.rays import JUMP, NO_JUMP, Field, SampledMethod, encoder
+from forewarp.methods.rays import JUMP, NO_JUMP, Field, SampledMethod, Terms, encoder
 from forewarp.ops.encode import encoded_size
 from forewarp.renderer import Sampled
 from forewarp.scene.view import Batch, Moment
@@ -60,9 +58,7 @@ class DNeRF(SampledMethod):
 
         return None, Field(self.template, self.activation, encoded, self.direction)
 
-    def extra_terms(
-        self, seen: Sampled, batch: Batch, factors: Mapping[str, float], generator: torch.Generator
-    ) -> dict[str, Callable[[], Tensor]]:
+    def extra_terms(self, seen: Sampled, batch: Batch, generator: torch.Generator) -> Terms:
         """Offer ``second_time``: squared differences of the offsets at a time up to the next training time,
         summed, as published; its authors have it off.
         """
@@ -80,8 +76,8 @@ class DNeRF(SampledMethod):
 
     def departures(self) -> list[str]:
         """See ``SampledMethod``."""
-        return super().departures() + ([NO_JUMP] if self.continuous else [])
+        return super().departures() + [NO_JUMP] * self.continuous
 
     def faults(self) -> list[str]:
         """See ``Method``."""
-        return super().faults() + ([] if self.continuous else [JUMP])
+        return super().faults() + [JUMP] * (not self.continuous)

@@ -18,16 +18,14 @@ _FIRST = 1e-5  # standard deviation of the slice's first weights
 class Slice(nn.Module):
     """The deformable slicing surface: observed points (..., 3) and a code -> ambient coordinates (..., A).
 
-    >>> sum(p.numel() for p in Slice(8, 2).parameters())
+    >>> sum(p.numel() for p in Slice(8, 2, width=64, frequencies=6, layers=6, skip=5).parameters())
     26626
     """
 
-    def __init__(
-        self, code_size: int, ambient: int, *, width: int = 64, frequencies: int = 6, layers: int = 6, skip=5
-    ) -> None:
+    def __init__(self, code_size: int, ambient: int, *, width: int, frequencies: int, **trunk) -> None:
         super().__init__()
         self.frequencies = frequencies
-        self.trunk = Trunk(6 * frequencies + code_size, width=width, layers=layers, skip=skip, glorot=True)
+        self.trunk = Trunk(6 * frequencies + code_size, width=width, **trunk, glorot=True)
         self.head = nn.Linear(width, ambient)
         nn.init.normal_(self.head.weight, std=_FIRST)
         nn.init.zeros_(self.head.bias)
@@ -96,9 +94,8 @@ class HyperNeRF(WarpedMethod):
         code, (octaves, ambient) = self.codes(moment.time), self.windows.tolist()
 
         def encoded(points: Tensor) -> Tensor:
-            beside = positional_encoding(
-                self.slice(points, code), self.ambient_frequencies, window=ambient, identity=False
-            )
+            sliced, count = self.slice(points, code), self.ambient_frequencies
+            beside = positional_encoding(sliced, count, window=ambient, identity=False)
             return torch.cat([self.position(self.warp(points, code, octaves)), beside], -1)
 
         return self.both(encoded, self.direction)

@@ -9,9 +9,8 @@ from typing import Any, ClassVar, Protocol, runtime_checkable
 import torch
 from torch import Tensor, nn
 
-from forewarp.fields.grids import VoxelGrid
 from forewarp.fields.moving import MovingGaussians
-from forewarp.ops.backend import is_number
+from forewarp.ops.backend import check_value, is_number
 from forewarp.scene.box import Box, Lattice
 from forewarp.scene.cloud import Cloud, Ellipsoids, Handover
 from forewarp.scene.frame import Frame, Scene
@@ -106,7 +105,8 @@ class Method(nn.Module):
         effects: its optional parts (see ``methods.effect``).
         still_steps: steps after which a fit without effects shows what it can't explain, for a plan.
         grows: dotted names of the parameters and buffers whose number of rows may change during training;
-            they adopt a checkpoint's.
+            they adopt a checkpoint's. A part of it may have a ``grows`` of its own.
+        loose: those of them that ``misfit`` itself compares with the others, as they have rows of their own.
         on_cpu: why ``trainer=auto`` should leave a GPU aside, in a few words; None: it should not.
         betas: of Adam.
     """
@@ -118,6 +118,7 @@ class Method(nn.Module):
     effects: ClassVar[Sequence] = ()
     still_steps: ClassVar[int] = 150
     grows: ClassVar[Sequence[str]] = ()
+    loose: ClassVar[Sequence[str]] = ()
     on_cpu: ClassVar[str | None] = None
     betas: ClassVar[tuple[float, float]] = (0.9, 0.99)
 
@@ -190,28 +191,30 @@ class Method(nn.Module):
 
     def adopted(self) -> set[str]:
         """Return the names in ``state_dict`` that adopt a checkpoint's shape."""
-        names = set(self.grows)
-        for place, grid in self._grids().items():
-            names |= {f"{place}.{name}" for name in ("voxels", "index", *grid.names)}
-        return names
+        return {place + name for place, part in self._growing().items() for name in part.grows}
 
-    def _grids(self) -> dict[str, VoxelGrid]:
-        return {name: part for name, part in self.named_modules() if isinstance(part, VoxelGrid)}
+    def _growing(self) -> dict[str, nn.Module]:
+        """The method and those of its parts that grow, by the beginning of their names in ``state_dict``."""
+        parts = self.named_modules()
+        return {f"{place}." if place else "": part for place, part in parts if hasattr(part, "grows")}
 
     def misfit(self, state: Mapping[str, Tensor]) -> str | None:
         """Return the name of a stored entry that contradicts the others; None if there is none.
 
-        All tensors in ``grows`` need the same number of rows, as kernels index one by the rows of another,
-        and the voxels of a grid must fit its lattice.
+        All tensors in ``grows`` need the same number of rows, as kernels index one by the rows of another. A
+        part has a ``misfit(state, place)`` for what else must fit, as the voxels of a grid its lattice.
         """
-        for place, grid in self._grids().items():
-            if (name := grid.misfit(state, f"{place}.")) is not None:
-                return f"{place}.{name}"
-        rows = {tuple(getattr(state[name], "shape", ()))[:1] for name in self.grows[:1]}
-        for name in self.grows:
-            shape, own = tuple(getattr(state[name], "shape", ())), part_of(self, name)
-            fits = bool(shape) and shape[:1] in rows and shape[1:] == tuple(own.shape[1:])
-            if not fits or state[name].dtype != own.dtype:
+        for place, part in self._growing().items():
+            rows = None
+            for name in part.grows:
+                own, stored = part_of(part, name), state[place + name]
+                fits = torch.is_tensor(stored) and (stored.dtype, stored.dim()) == (own.dtype, own.dim())
+                if fits and name not in part.loose:
+                    rows = len(stored) if rows is None else rows
+                    fits = stored.shape == (rows, *own.shape[1:])
+                if not fits:
+                    return place + name
+            if part is not self and (name := part.misfit(state, place)):
                 return name
         return None
 
@@ -246,7 +249,7 @@ class Method(nn.Module):
         """
 
     def _load_from_state_dict(self, state_dict, prefix, *args, **kwargs) -> None:
-        for name in self.grows:  # including those of submodules, which load later
+        for name in self.adopted():  # including those of submodules, which load later
             if prefix + name in state_dict:
                 own = part_of(self, name)
                 own.data = own.data.new_empty(state_dict[prefix + name].shape)
@@ -332,7 +335,11 @@ class HasMovingGaussians(Protocol):
 
 @runtime_checkable
 class HasLayers(Protocol):
-    """Tell what moves from what rests, row by row of ``HasEllipsoids``."""
+    """Tell what moves from what rests, row by row of ``HasEllipsoids``.
+
+    A snapshot also has ``share(view, rows)``: the share (R,) in [0, 1] of each pixel of a view that is rows
+    (N,) bool, as nothing hides it.
+    """
 
     def in_motion(self, frames: Sequence[Frame]) -> Tensor:
         """Return which rows (N,) bool move so that images like ``frames`` show it: about a pixel and more."""
@@ -349,14 +356,6 @@ class HasCommon(Protocol):
         """Return, for each row of ``HasMovingGaussians``, the row of that run (N,) int64 which it still is;
         -1: of none; ascending but for these. None: the run began from no other.
         """
-
-
-@runtime_checkable
-class HasShares(Protocol):
-    """Of a snapshot of ``HasLayers``: tell how much of a view some rows are."""
-
-    def share(self, view: View, rows: Tensor) -> Tensor:
-        """Return the share (R,) in [0, 1] of each pixel that is rows (N,) bool, as nothing hides it."""
 
 
 @runtime_checkable
@@ -378,8 +377,7 @@ def check_number(key: str, given: Any, wanted: str, good: Callable[[float], bool
     Raises:
         ValueError: naming the key, and in words what it takes.
     """
-    if not is_number(given) or not good(given):
-        raise ValueError(f"{key}: expected {wanted}, but got {given!r}")
+    check_value(key, given, wanted, lambda value: is_number(value) and good(value))
 
 
 def check_least(least: int = 0, *, of: str = "model", **given: Any) -> None:
@@ -389,19 +387,17 @@ def check_least(least: int = 0, *, of: str = "model", **given: Any) -> None:
         ValueError: naming the key.
     """
     for name, count in given.items():
-        if isinstance(count, bool) or not isinstance(count, int) or count < least:
-            raise ValueError(f"{of}.{name}: expected a whole number >= {least}, but got {count}")
+        wanted = f"a whole number >= {least}"
+        check_value(f"{of}.{name}", count, wanted, lambda number: type(number) is int and number >= least)
 
 
-def check_pair(key: str, given: Any) -> None:
-    """Refuse what is not two whole numbers >= 1.
+def check_effects(key: str, given: Sequence[str], names: Sequence[str]) -> None:
+    """Refuse effects of a stage, ``stage.<name>.effects``, that are not among ``names``.
 
     Raises:
         ValueError: naming the key.
     """
-    pair = isinstance(given, list | tuple) and len(given) == 2
-    if not pair or not all(type(number) is int and number >= 1 for number in given):
-        raise ValueError(f"{key}: expected two whole numbers >= 1, but got {given}")
+    check_value(key, list(given), f"some of {', '.join(names)}", set(names).issuperset)
 
 
 def steps_of(
@@ -426,9 +422,8 @@ def steps_of(
     good = pairs and all(0 <= begin <= 1 and count >= least for begin, count in pairs)
     if not good or fractions != sorted(fractions) or (from_start and fractions[0] != 0):
         form = "[[0, count], [fraction, count], ...]" if from_start else "[[fraction, count], ...]"
-        raise ValueError(
-            f"{key}: expected {form} with ascending fractions and counts >= {least:g}, but got {given}"
-        )
+        wanted = f"{form} with ascending fractions and counts >= {least:g}"
+        raise ValueError(f"{key}: expected {wanted}, but got {given}")
     return pairs
 
 

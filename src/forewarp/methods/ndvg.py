@@ -15,8 +15,9 @@ from forewarp import losses
 from forewarp.fields.grids import VoxelGrid, density_shift
 from forewarp.fields.networks import mlp
 from forewarp.fields.occupancy import Occupancy
-from forewarp.methods.method import Start, check_least, check_number, check_pair, those_that_hold
-from forewarp.methods.rays import JUMP, NO_JUMP, MarchedMethod, Marching, regrow, whole_grid
+from forewarp.methods.method import Start, check_least, check_number, those_that_hold
+from forewarp.methods.rays import JUMP, NO_JUMP, MarchedMethod, Marching, Terms, regrow, whole_grid
+from forewarp.ops.backend import check_value
 from forewarp.ops.encode import encoded_size, positional_encoding
 from forewarp.ops.grid import dilate, second_variation, trilinear
 from forewarp.scene.box import Box, Lattice
@@ -55,12 +56,15 @@ class NDVGStage:
     carry: bool = False
     masked: bool = True
 
-    def checked(self, where: str) -> NDVGStage:
-        """Return this; ``ValueError`` for a number out of range, naming its key in ``where``."""
-        check_number(f"{where}.deformation_voxels", self.deformation_voxels, "a number > 0", lambda n: n > 0)
-        check_number(f"{where}.sink", self.sink, "a number >= 0", lambda fall: fall >= 0)
-        check_number(f"{where}.box_alpha", self.box_alpha, "a number in [0, 1)", lambda part: 0 <= part < 1)
-        return self
+    @classmethod
+    def of(cls, start: Start) -> NDVGStage:
+        """Take a stage's numbers; ``ValueError`` for one that is out of range, naming its key."""
+        made = cls(**{f.name: start.numbers[f.name] for f in fields(cls) if f.name in start.numbers})
+        where = f"stage.{start.stage}"
+        check_number(f"{where}.deformation_voxels", made.deformation_voxels, "a number > 0", lambda n: n > 0)
+        check_number(f"{where}.sink", made.sink, "a number >= 0", lambda fall: fall >= 0)
+        check_number(f"{where}.box_alpha", made.box_alpha, "a number in [0, 1)", lambda part: 0 <= part < 1)
+        return made
 
 
 class NDVG(MarchedMethod):
@@ -96,13 +100,11 @@ class NDVG(MarchedMethod):
     ) -> None:
         tight = start.handover is not None and start.handover.tight
         box = start.handover.box if tight else start.scene.box
-        where = f"stage.{start.stage}"
-        super().__init__(start, marching, box, f"{where}.alpha_init")
-        check_pair("model.width", width)
-        check_pair("model.channels", channels)
+        super().__init__(start, marching, box, f"stage.{start.stage}.alpha_init")
+        for key, pair in (("width", width), ("channels", channels)):
+            check_value(f"model.{key}", pair, "two whole numbers >= 1", _is_pair)
         check_least(frequencies=frequencies, direction_frequencies=direction_frequencies)
-        given = {f.name: start.numbers[f.name] for f in fields(NDVGStage) if f.name in start.numbers}
-        self.stage = NDVGStage(**given).checked(where)
+        self.stage = NDVGStage.of(start)
         self.shift = density_shift(self.stage.alpha_init, self.alpha_key)
         self.canonical_time = start.scene.canonical_time
         self.octaves, self.continuous = (frequencies, direction_frequencies), continuous
@@ -195,9 +197,7 @@ class NDVG(MarchedMethod):
         found = looked.bounds(self.stage.box_alpha)
         return None if found is None else found.scaled(_BOX)
 
-    def extra_terms(
-        self, field: NDVGField, batch: Batch, generator: torch.Generator
-    ) -> dict[str, Callable[[], Tensor | None]]:
+    def extra_terms(self, field: NDVGField, batch: Batch, generator: torch.Generator) -> Terms:
         """Offer ``flow_l1``, the samples' offsets; ``tv_deformation``; ``canonical``, offsets of samples at
         the canonical time, which ``F`` should give as 0; ``still``, at points that never move.
 
@@ -224,12 +224,8 @@ class NDVG(MarchedMethod):
             points = self.some_still(_STILL, generator)
             return None if points is None else field.offset(points)[0].square().mean()
 
-        return {
-            "flow_l1": lambda: of_all(field.offsets),
-            "tv_deformation": tv_deformation,
-            "canonical": canonical,
-            "still": still,
-        }
+        terms = {"flow_l1": lambda: of_all(field.offsets), "tv_deformation": tv_deformation}
+        return terms | {"canonical": canonical, "still": still}
 
     def param_groups(self) -> dict[str, list[nn.Parameter]]:
         """Group parameters: ``density``, ``color`` and ``deformation`` (the grids), ``network``."""
@@ -293,6 +289,11 @@ def _read(grid: VoxelGrid, name: str, points: Tensor) -> Tensor:
     """Read a parameter (N, C) of a dense grid at world points (P, 3): (P, C)."""
     values = grid.parameter(name)
     return trilinear(values, grid.index, grid.lattice.to_lattice(points), values.new_zeros(values.shape[1]))
+
+
+def _is_pair(given: object) -> bool:
+    is_two = isinstance(given, list | tuple) and len(given) == 2
+    return is_two and all(type(number) is int and number >= 1 for number in given)
 
 
 def _some(times: Sequence[float]) -> list[float]:

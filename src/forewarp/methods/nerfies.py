@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-
 import torch
 from torch import Tensor
 
 from forewarp.fields.networks import CameraCodes, Template, drawn
 from forewarp.methods.method import Start
-from forewarp.methods.rays import Field, WarpedMethod
+from forewarp.methods.rays import Field, Terms, WarpedMethod
 from forewarp.renderer import Sampled
 from forewarp.scene.view import Batch, Moment
 
@@ -67,9 +65,7 @@ class Nerfies(WarpedMethod):
 
         return self.both(encoded, condition)
 
-    def extra_terms(
-        self, seen: Sampled, batch: Batch, factors: Mapping[str, float], generator: torch.Generator
-    ) -> dict[str, Callable[[], Tensor | None]]:
+    def extra_terms(self, seen: Sampled, batch: Batch, generator: torch.Generator) -> Terms:
         """Offer also ``elastic``, at the samples of the coarse pass."""
 
         def elastic() -> Tensor:
@@ -79,4 +75,4 @@ class Nerfies(WarpedMethod):
             strain = self.warp.elastic(some[:, :3], self.codes(batch.time), self.octaves_in)
             return (some[:, 3] * strain).sum() * (len(weighted) / max(len(some), 1) / max(len(batch), 1))
 
-        return {"elastic": elastic} | super().extra_terms(seen, batch, factors, generator)
+        return {"elastic": elastic} | super().extra_terms(seen, batch, generator)

@@ -5,22 +5,18 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
+from itertools import chain
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from forewarp.fields.networks import (
-    DEVIATION_SCALE,
-    AffineMixture,
-    PictureEncoder,
-    VolumeDecoder,
-    beside,
-    read,
-)
+from forewarp.fields.networks import beside, start_as_glorot
 from forewarp.methods.method import Start, Step, check_number, those_that_hold
 from forewarp.methods.rays import BETWEEN_TIMES, CENTRES, ONE_TIME, DeadStart, RayMethod, RaySnapshot
+from forewarp.ops.backend import check_value
+from forewarp.ops.gaussians import rotations
 from forewarp.ops.march import clip_to_box
 from forewarp.renderer import in_chunks
 from forewarp.scene.camera import Rays
@@ -30,6 +26,132 @@ from forewarp.scene.view import Batch, Moment, Rendering, View
 _MOST = 3  # pictures of an instant, as published
 _POINTS = 1 << 19  # read at once for an image
 _MEAN, _DEVIATION = 100.0, 25.0  # of pictures in [0, 255]
+_SCALE = 0.01  # of the layer that gives the logarithm of the deviation
+_SLOPE = 0.2  # of leaky ReLUs
+_LEAST = 1e-3  # least total weight of the maps at a point
+_SHORT = 1e-5  # added to the squared length of a quaternion
+_start_leaky = partial(start_as_glorot, gain=nn.init.calculate_gain("leaky_relu", _SLOPE))
+
+
+class PictureEncoder(nn.Module):
+    """Pictures of an instant (K, 3, H, W) -> mean and logarithm of the deviation of a code, (C,) each.
+
+    Args:
+        pictures: K, each with convolutions of its own.
+        size: H and W, multiples of ``2**len(tower)``.
+        tower: channels of the convolutions (4 x 4, stride 2).
+        width: channels of the layer that joins the pictures.
+        code: C.
+    """
+
+    def __init__(
+        self, pictures: int, size: tuple[int, int], *, tower: Sequence[int], width: int, code: int
+    ) -> None:
+        super().__init__()
+        by = 2 ** len(tower)
+        wanted = f"height and width in multiples of {by}, as the tower halves {len(tower)} times"
+        good = len(size) == 2 and min(size) >= by and not any(side % by for side in size)
+        check_value("model.picture_size", list(size), wanted, lambda _: good)
+        steps = list(zip((3, *tower[:-1]), tower))
+        self.towers = nn.ModuleList()
+        for _ in range(pictures):
+            layers = [(nn.Conv2d(i, o, 4, 2, 1), nn.LeakyReLU(_SLOPE)) for i, o in steps]
+            self.towers.append(nn.Sequential(*chain(*layers)))
+        self.joined = nn.Linear(pictures * tower[-1] * (size[0] // by) * (size[1] // by), width)
+        self.mean, self.deviation = nn.Linear(width, code), nn.Linear(width, code)
+        self.apply(_start_leaky)
+        for last in (self.mean, self.deviation):
+            start_as_glorot(last)
+
+    def forward(self, pictures: Tensor) -> tuple[Tensor, Tensor]:
+        """See the class."""
+        seen = [tower(one[None]).flatten() for tower, one in zip(self.towers, pictures, strict=True)]
+        hidden = functional.leaky_relu(self.joined(torch.cat(seen)), _SLOPE)
+        return 0.1 * self.mean(hidden), _SCALE * self.deviation(hidden)
+
+
+class VolumeDecoder(nn.Module):
+    """A code (C,) -> raw values (4, S, S, S), S = ``2**len(channels)``: three of colour, then opacity."""
+
+    def __init__(self, code: int, channels: Sequence[int]) -> None:
+        super().__init__()
+        self.first = nn.Linear(code, channels[0])
+        steps = zip(channels, (*channels[1:], 4))
+        self.grow = nn.ModuleList(nn.ConvTranspose3d(i, o, 4, 2, 1) for i, o in steps)
+        self.apply(_start_leaky)
+        start_as_glorot(self.grow[-1])
+
+    def forward(self, code: Tensor) -> Tensor:
+        """See the class."""
+        volume = self.first(code).reshape(1, -1, 1, 1, 1)
+        for layer in self.grow:
+            volume = layer(functional.leaky_relu(volume, _SLOPE))
+        return volume[0]
+
+
+class AffineMixture(nn.Module):
+    """An inverse warp: ``W(x) = sum_i g_i(A_i x) A_i x / max(sum_i g_i(A_i x), 0.001)`` with affine maps
+    ``A_i x = s_i * R_i (x - t_i)`` and decoded weights ``g_i`` on a lattice, beyond which they are as at its
+    border.
+
+    Args:
+        code: C.
+        maps: their number.
+        side: lattice points along an axis of the weights and of W.
+        width, weight_width: hidden channels of the maps and of the weights.
+        from_identity: add 1 to ``s`` and the identity to ``R``, so that W is near the identity where codes
+            are small. As released, scales of either sign and any rotations are mixed at first.
+    """
+
+    def __init__(
+        self, code: int, *, maps: int, side: int, width: int, weight_width: int, from_identity: bool
+    ) -> None:
+        super().__init__()
+        self.maps, self.side, self.from_identity = maps, side, from_identity
+
+        def head(hidden: int, out: int) -> nn.Sequential:
+            return nn.Sequential(nn.Linear(code, hidden), nn.LeakyReLU(_SLOPE), nn.Linear(hidden, out))
+
+        self.scale, self.turn, self.shift = (head(width, maps * size) for size in (3, 4, 3))
+        self.weight = head(weight_width, maps * side**3)
+        self.apply(_start_leaky)
+        for branch in (self.scale, self.turn, self.shift, self.weight):
+            start_as_glorot(branch[-1])
+        axis = torch.linspace(-1, 1, side)
+        z, y, x = torch.meshgrid(axis, axis, axis, indexing="ij")
+        self.register_buffer("lattice", torch.stack([x, y, z], -1), persistent=False)
+
+    def moved(self, code: Tensor, points: Tensor) -> Tensor:
+        """Apply each map to points (..., 3): (M, ..., 3)."""
+        scale = self.scale(code).reshape(self.maps, 3)
+        turn = self.turn(code).reshape(self.maps, 4)
+        shift = 0.1 * self.shift(code).reshape(self.maps, 3)
+        if self.from_identity:
+            scale = 1 + scale
+            turn = turn + turn.new_tensor([1.0, 0.0, 0.0, 0.0])
+        squared, eye = turn.square().sum(-1)[:, None, None], torch.eye(3).to(turn)
+        rotation = eye + (rotations(turn) - eye) * squared / (squared + _SHORT)  # smooth also where turn is 0
+        flat = points.reshape(-1, 3) - shift[:, None]
+        found = scale[:, None] * (flat @ rotation.mT)
+        return found.reshape(self.maps, *points.shape)
+
+    def forward(self, code: Tensor) -> Tensor:
+        """Code (C,) -> W at the lattice's points (3, S, S, S)."""
+        places = self.moved(code, self.lattice)
+        weights = self.weight(code).exp().reshape(self.maps, 1, *[self.side] * 3)
+        weights = functional.grid_sample(weights, places, padding_mode="border", align_corners=True)
+        weights = weights[:, 0, ..., None]
+        whole = (weights * places).sum(0) / weights.sum(0).clamp(min=_LEAST)
+        return whole.permute(3, 0, 1, 2)
+
+
+def read(volume: Tensor, points: Tensor, padding: str = "zeros") -> Tensor:
+    """Read a volume (C, S, S, S) at points (N, 3) of the cube, trilinearly: (N, C).
+
+    Beyond the cube lies 0, or with padding ``border`` what is nearest.
+    """
+    at = points.reshape(1, 1, 1, -1, 3)
+    return functional.grid_sample(volume[None], at, padding_mode=padding, align_corners=True)[0, :, 0, 0].T
 
 
 @dataclass(frozen=True)
@@ -57,9 +179,9 @@ class NeuralVolumes(RayMethod):
     Args:
         start: scene, stage and numbers.
         pictures: of an instant, taken by as many fixed cameras; null: as many as there are, at most 3.
-        picture_size, tower, features, code: see ``fields.networks.PictureEncoder``.
-        decoder: see ``fields.networks.VolumeDecoder``.
-        maps, warp_side, warp_width, weight_width, from_identity: see ``fields.networks.AffineMixture``.
+        picture_size, tower, features, code: see ``PictureEncoder``.
+        decoder: see ``VolumeDecoder``.
+        maps, warp_side, warp_width, weight_width, from_identity: see ``AffineMixture``.
         first_opacity: of the volume before training, > 0; null: as released, about 0.7, with which most rays
             are opaque at first, and the background has no part in them.
         first_deviation: of the code before training, > 0; null: as released, about 1, many times the code.
@@ -113,7 +235,7 @@ class NeuralVolumes(RayMethod):
         self.encoder = PictureEncoder(len(shots[0]), size, tower=tower, width=features, code=code)
         self.decoder = VolumeDecoder(code, decoder)
         if first_deviation is not None:
-            nn.init.constant_(self.encoder.deviation.bias, math.log(first_deviation) / DEVIATION_SCALE)
+            nn.init.constant_(self.encoder.deviation.bias, math.log(first_deviation) / _SCALE)
         if first_opacity is not None:
             nn.init.constant_(self.decoder.grow[-1].bias[3], math.log(math.expm1(first_opacity)))
         shape = {"maps": maps, "side": warp_side, "width": warp_width, "weight_width": weight_width}
@@ -188,10 +310,8 @@ class NeuralVolumes(RayMethod):
         rgb = near.new_zeros(len(near), 3).index_add(0, row, weights[inside][:, None] * color)
         total = weights.sum(1)
         depth = half * (weights * depths).sum(1) / total.clamp(min=1e-6)
-        rgb, depth, total = (
-            part.new_zeros(len(rays), *part.shape[1:]).index_copy(0, met, part)
-            for part in (rgb, depth, total)
-        )
+        hit = rgb, depth, total
+        rgb, depth, total = (x.new_zeros(len(rays), *x.shape[1:]).index_copy(0, met, x) for x in hit)
         if tint is not None:
             rgb = rgb * tint[0] + tint[1]
         return Rendering(rgb + (1 - total)[:, None] * background.to(rgb), depth, total)
@@ -278,10 +398,8 @@ def shots_of(scene: Scene, wanted: int | None) -> list[list[Frame]]:
     fixed = sorted(set.intersection(*({frame.camera_id for frame in frames} for frames in by_time)) - {None})
     there = max(len(fixed), 1)
     if wanted is not None and not 1 <= wanted <= there:
-        raise ValueError(
-            f"model.pictures: expected at most {there}, as so many cameras took training pictures at every "
-            f"instant, but got {wanted}; set model.pictures=null"
-        )
+        why = f"as so many cameras took training pictures at every instant, but got {wanted}"
+        raise ValueError(f"model.pictures: expected at most {there}, {why}; set model.pictures=null")
     if not fixed:
         return [frames[:1] for frames in by_time]
     chosen = [fixed[i] for i in spread(len(fixed), min(wanted or _MOST, there))]

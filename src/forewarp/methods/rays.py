@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -25,6 +25,7 @@ from forewarp.methods.method import (
     those_that_hold,
 )
 from forewarp.methods.rows import RowsAdam, renew_parameters
+from forewarp.ops.backend import check_value
 from forewarp.ops.encode import encoded_size, positional_encoding
 from forewarp.ops.march import warm_up
 from forewarp.renderer import Marched, Quadrature, Renderer, Sampled, in_chunks
@@ -43,6 +44,8 @@ JUMP = "offsets jump at the canonical time (continuous)"  # the fault that ``NO_
 # What differs from the publications in every preset, of those whose code is in PyTorch, and in JAX.
 OF_PYTORCH = (CENTRES, ALONG_RAYS, "no centre crop at first")
 OF_JAX = (ONE_TIME, BETWEEN_TIMES)
+
+Terms = dict[str, Callable[[], Tensor | None]]  # see ``Step``
 
 _PATIENCE = 20  # steps without a gradient after which a run ends
 _LOOK_EVERY = 8  # steps between two looks for where matter is
@@ -81,6 +84,10 @@ class DeadStart:
             )
 
 
+def _named(rendering: Rendering, *names: str) -> Iterator[tuple[str, Tensor]]:
+    return ((name, getattr(rendering, name)) for name in names)
+
+
 class RayMethod(Method):
     """A method that answers for any rays at a moment, without computing anything for the moment before.
 
@@ -90,15 +97,21 @@ class RayMethod(Method):
 
     sees_by_camera = False
 
-    def along(
-        self, moment: Moment, rays: Rays, background: Tensor, generator: torch.Generator | None = None
-    ) -> Rendering:
-        """Render R rays over ``background`` (3,) or (R, 3); ``generator`` jitters the samples."""
+    def along(self, moment: Moment, rays: Rays, background: Tensor) -> Rendering:
+        """Render R rays over ``background`` (3,) or (R, 3)."""
         raise NotImplementedError
 
     def image(self, moment: Moment, rays: Rays, background: Tensor) -> Rendering:
         """Render an image's rays without gradient, in chunks for images of any size."""
         raise NotImplementedError
+
+    def parts_of(self, batch: Batch) -> list[tuple[Moment, Rays, Tensor]]:
+        """Return moment, rays and background of a batch of one time; by camera where that matters."""
+        parts = []
+        for part in batch.split() if self.sees_by_camera else [batch]:
+            rays, _, background = part.joined()
+            parts.append((part.observations[0].moment, rays.to(self.device), background.to(self.device)))
+        return parts
 
     def at(self, moment: Moment) -> RaySnapshot:
         """Fix the time; compute nothing yet."""
@@ -174,8 +187,8 @@ class Sampling:
     def __post_init__(self) -> None:
         check_number("model.sampling.hull", self.hull, *FRACTION)
         check_least(of="model.sampling", occupancy=self.occupancy)
-        if self.density not in ("relu", "softplus"):
-            raise ValueError(f"model.sampling.density: expected relu or softplus, but got {self.density!r}")
+        known = ("relu", "softplus")
+        check_value("model.sampling.density", self.density, " or ".join(known), known.__contains__)
 
     def departures(self, density: str, jitters: bool) -> list[str]:
         """List what differs from a publication's density, and whether it ``jitters`` samples in images."""
@@ -257,16 +270,14 @@ class SampledMethod(RayMethod):
         """
         raise NotImplementedError
 
-    def extra_terms(
-        self, seen: Sampled, batch: Batch, factors: Mapping[str, float], generator: torch.Generator
-    ) -> dict[str, Callable[[], Tensor | None]]:
+    def extra_terms(self, seen: Sampled, batch: Batch, generator: torch.Generator) -> Terms:
         """Return the loss terms beside the errors of the passes."""
         return {}
 
     def along(
         self, moment: Moment, rays: Rays, background: Tensor, generator: torch.Generator | None = None
     ) -> Sampled:
-        """See ``RayMethod``; also return what lies along the rays."""
+        """See ``RayMethod``; also return what lies along the rays. ``generator`` jitters the samples."""
         first, second = self.fields(moment)
         coarse = None if first is None else first.radiance
         return self.quadrature(second.density, second.radiance, rays, background, generator, coarse=coarse)
@@ -285,35 +296,28 @@ class SampledMethod(RayMethod):
             ValueError: if the density of a pass is 0 at every sample, or no sample is left, for many steps:
                 there is then no gradient.
         """
-        rgb, parts = batch.joined()[1], batch.split() if self.sees_by_camera else [batch]
-        seen = Sampled.joined([self._along_batch(part, generator) for part in parts])
+        rgb = batch.joined()[1]
+        seen = Sampled.joined([self.along(*part, generator) for part in self.parts_of(batch)])
         passes = [seen] if seen.coarse is None else [seen.coarse, seen]
         self.dead_start.look(all(bool((rendering.density > 0).any()) for rendering in passes))
         error = (seen.rgb - rgb).square().mean()
         terms = {"photo": lambda: error}
         if "coarse_photo" in self.terms:
             terms["coarse_photo"] = lambda: seen.coarse and (seen.coarse.rgb - rgb).square().mean()
-        return Step(
-            terms | self.extra_terms(seen, batch, factors, generator),
-            error.detach(),
-            {"samples": seen.depths.numel(), "opacity": float(seen.opacity.detach().mean())},
-            tensors=lambda: ((name, getattr(seen, name)) for name in ("density", "weights", "rgb")),
-        )
-
-    def _along_batch(self, batch: Batch, generator: torch.Generator) -> Sampled:
-        (rays, _, background), moment = batch.joined(), batch.observations[0].moment
-        return self.along(moment, rays.to(self.device), background.to(self.device), generator)
+        terms |= self.extra_terms(seen, batch, generator)
+        noted = {"samples": seen.depths.numel(), "opacity": float(seen.opacity.detach().mean())}
+        return Step(terms, error.detach(), noted, tensors=lambda: _named(seen, "density", "weights", "rgb"))
 
     def advance(self, progress: float, step: int, optimizer: torch.optim.Optimizer) -> dict[str, float]:
         """See ``Method``; look now and then for where matter is."""
         if self.occupancy is None or step % _LOOK_EVERY:
             return {}
-
-        def density(points: Tensor, time: float) -> Tensor:
-            return self.fields(Moment(time))[1].density(points)
-
-        self.occupancy.look(density, self.times, torch.default_generator)
+        self.occupancy.look(self.density_at, self.times, torch.default_generator)
         return {"occupied": float(self.occupancy.occupied.float().mean())}
+
+    def density_at(self, points: Tensor, time: float) -> Tensor:
+        """World points (P, 3) and a time -> density (P,), per world unit."""
+        return self.fields(Moment(time))[1].density(points)
 
     def departures(self) -> list[str]:
         """See ``Method``; a subclass adds its own to those of the sampling and of the platform."""
@@ -341,6 +345,7 @@ class WarpedMethod(SampledMethod):
         network: width, layers, direction_frequencies: see ``SampledMethod``.
     """
 
+    octaves_in: float  # of the warp's encoding: how many count
     shares = {"warp_in": 0.32}  # of the stage, where its numbers do not say
     numbers = tuple(shares)
     published = "softplus"
@@ -372,14 +377,7 @@ class WarpedMethod(SampledMethod):
             check_number(f"stage.{start.stage}.{name}", self.shares[name], *FRACTION)
         self.still, self.still_points = start.scene.still, still_points
 
-    @property
-    def octaves_in(self) -> float:
-        """How many octaves of the warp's encoding count."""
-        raise NotImplementedError
-
-    def extra_terms(
-        self, seen: Sampled, batch: Batch, factors: Mapping[str, float], generator: torch.Generator
-    ) -> dict[str, Callable[[], Tensor | None]]:
+    def extra_terms(self, seen: Sampled, batch: Batch, generator: torch.Generator) -> Terms:
         """Offer ``still``, at points that never move."""
 
         stray, codes = self.warp.stray, self.codes.table
@@ -453,6 +451,7 @@ class MarchedMethod(RayMethod):
         alpha_key: of the opacity at first.
     """
 
+    lattice_marched: Lattice  # that a step is a share of, as it is now
     terms = ("photo", "point_color", "background_entropy")
     numbers = ("num_voxels", "color_threshold")
 
@@ -469,7 +468,7 @@ class MarchedMethod(RayMethod):
             threshold = marching.color_threshold
         check_number(f"{where}.color_threshold", threshold, *_THRESHOLD)
         self.renderer = Renderer(step=marching.step, color_threshold=threshold)
-        self.occupancy = Occupancy(box, side=marching.occupancy, patience=8) if marching.occupancy else None
+        self.occupancy = Occupancy(box, side=marching.occupancy) if marching.occupancy else None
         advice = f"set it to 0, or a larger {alpha_key}, or preset.occupancy=0"
         self.dead_start = DeadStart("preset.color_threshold", "no sample of so much weight", advice)
 
@@ -478,13 +477,8 @@ class MarchedMethod(RayMethod):
         self.register_buffer("voxels", torch.tensor(self.schedule[0][1], dtype=torch.float64))
         self.register_buffer("raised", torch.ones(len(self.param_groups()), dtype=torch.float64))
 
-    @property
-    def lattice_marched(self) -> Lattice:
-        """The lattice that a step is a share of, as it is now."""
-        raise NotImplementedError
-
     def marching_lattice(self, num_voxels: float) -> Lattice:
-        """Return that lattice with about ``num_voxels`` voxels."""
+        """Return ``lattice_marched`` with about ``num_voxels`` voxels."""
         raise NotImplementedError
 
     @property
@@ -500,9 +494,7 @@ class MarchedMethod(RayMethod):
         """Resample the lattices to about ``num_voxels`` voxels."""
         raise NotImplementedError
 
-    def extra_terms(
-        self, field: PointField, batch: Batch, generator: torch.Generator
-    ) -> dict[str, Callable[[], Tensor | None]]:
+    def extra_terms(self, field: PointField, batch: Batch, generator: torch.Generator) -> Terms:
         """Return the loss terms beside those of the rays.
 
         ``field`` has been asked at the rays' samples, or where it sees by camera at those of the first.
@@ -516,11 +508,9 @@ class MarchedMethod(RayMethod):
         rows = torch.randint(len(self.still), (min(count, len(self.still)),), generator=generator)
         return self.still[rows].to(self.device)
 
-    def along(
-        self, moment: Moment, rays: Rays, background: Tensor, generator: torch.Generator | None = None
-    ) -> Marched:
+    def along(self, moment: Moment, rays: Rays, background: Tensor) -> Marched:
         """See ``RayMethod``; also return the samples."""
-        return self.marched(self.field(moment), rays, background, generator)
+        return self.marched(self.field(moment), rays, background)
 
     def image(self, moment: Moment, rays: Rays, background: Tensor) -> Rendering:
         """See ``RayMethod``."""
@@ -544,13 +534,9 @@ class MarchedMethod(RayMethod):
         Raises:
             ValueError: if no sample has a colour for many steps.
         """
-        rgb, parts = batch.joined()[1], batch.split() if self.sees_by_camera else [batch]
-        fields, seen = [self.field(part.observations[0].moment) for part in parts], []
-        for field, part in zip(fields, parts):
-            rays, _, background = part.joined()
-            jitter = generator if self.marching.jitter else None
-            seen.append(self.marched(field, rays.to(self.device), background.to(self.device), jitter))
-        drawn = Marched.joined(seen)
+        rgb, jitter = batch.joined()[1], generator if self.marching.jitter else None
+        parts = [(self.field(moment), *part) for moment, *part in self.parts_of(batch)]
+        drawn = Marched.joined([self.marched(*part, jitter) for part in parts])
         self.dead_start.look(len(drawn.weights) > 0)
         error = (drawn.rgb - rgb).square().mean()
         terms = {
@@ -558,12 +544,9 @@ class MarchedMethod(RayMethod):
             "point_color": lambda: losses.point_color(drawn.weights, drawn.colors, drawn.ray_ids, rgb),
             "background_entropy": lambda: losses.background_entropy(drawn.transmittance),
         }
-        return Step(
-            terms | self.extra_terms(fields[0], batch, generator),
-            error.detach(),
-            {"samples": drawn.samples, "opacity": float(drawn.opacity.detach().mean())},
-            tensors=lambda: ((name, getattr(drawn, name)) for name in ("weights", "colors", "rgb")),
-        )
+        terms |= self.extra_terms(parts[0][0], batch, generator)
+        noted = {"samples": drawn.samples, "opacity": float(drawn.opacity.detach().mean())}
+        return Step(terms, error.detach(), noted, tensors=lambda: _named(drawn, "weights", "colors", "rgb"))
 
     def advance(self, progress: float, step: int, optimizer: torch.optim.Optimizer) -> dict[str, float]:
         """See ``Method``; grow, after which optimiser and learning rates start anew; look for matter."""

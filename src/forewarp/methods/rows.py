@@ -26,9 +26,8 @@ def keep_rows(method: nn.Module, rows: Tensor) -> tuple[list[Parameter], list[Pa
     before, after = [], []
     count = len(part_of(method, method.grows[0]))
     if rows.dtype != torch.int64 or (len(rows) and not 0 <= int(rows.min()) <= int(rows.max()) < count):
-        raise ValueError(
-            f"rows: expected int64 in [0, {count}), but got {rows.dtype}: {rows[:5].tolist()} ..."
-        )
+        came = f"{rows.dtype}: {rows[:5].tolist()} ..."
+        raise ValueError(f"rows: expected int64 in [0, {count}), but got {came}")
     for name in method.grows:
         place, _, last = name.rpartition(".")
         owner, value = method.get_submodule(place), part_of(method, name)

@@ -12,8 +12,8 @@ from torch import Tensor, nn
 from forewarp.fields.grids import density_shift, read_strided
 from forewarp.fields.networks import Template, mlp
 from forewarp.methods.method import FRACTION, Start, check_least, check_number, those_that_hold
-from forewarp.methods.rays import MarchedMethod, Marching, regrow, whole_grid
-from forewarp.ops.encode import encoded_size, positional_encoding
+from forewarp.methods.rays import MarchedMethod, Marching, Terms, encoder, regrow, whole_grid
+from forewarp.ops.encode import encoded_size
 from forewarp.ops.grid import huber_variation
 from forewarp.scene.box import Lattice
 from forewarp.scene.view import Batch, Moment
@@ -65,14 +65,11 @@ class TiNeuVox(MarchedMethod):
         self.frozen_from = start.numbers.get("frozen_from", 1.0)
         check_number(f"stage.{start.stage}.frozen_from", self.frozen_from, *FRACTION)
         self.frozen = False
-        octaves = {"position_frequencies": position_frequencies, "time_frequencies": time_frequencies}
-        octaves |= {
-            "feature_frequencies": feature_frequencies,
-            "direction_frequencies": direction_frequencies,
-        }
-        check_least(**octaves)
+        self.position = encoder("position", position_frequencies)
+        self.moment = encoder("time", time_frequencies)
+        self.feature = encoder("feature", feature_frequencies)
+        self.direction = encoder("direction", direction_frequencies)
         check_least(1, channels=channels, width=width)
-        self.octaves = tuple(octaves.values())
         self.shift = density_shift(alpha_init, self.alpha_key)
         self.grid = whole_grid(self.marching_lattice(self.schedule[0][1]), {"features": channels})
         place, moment = encoded_size(3, position_frequencies), encoded_size(1, time_frequencies)
@@ -109,8 +106,7 @@ class TiNeuVox(MarchedMethod):
 
     def code(self, network: nn.Module, number: float) -> Tensor:
         """A time, or a camera's number -> code (5 C,)."""
-        like = self.grid.features
-        return network(positional_encoding(like.new_tensor([number]), self.octaves[1]))
+        return network(self.moment(self.grid.features.new_tensor([number])))
 
     def grow(self, num_voxels: float, optimizer: torch.optim.Optimizer) -> None:
         """See ``MarchedMethod``."""
@@ -128,9 +124,7 @@ class TiNeuVox(MarchedMethod):
                 group["lr"] *= group["name"] != "grid"
         return noted
 
-    def extra_terms(
-        self, field: TiNeuVoxField, batch: Batch, generator: torch.Generator
-    ) -> dict[str, Callable[[], Tensor | None]]:
+    def extra_terms(self, field: TiNeuVoxField, batch: Batch, generator: torch.Generator) -> Terms:
         """Offer ``still``, at points that never move, and ``tv_grid``, the grid's total variation."""
 
         def still() -> Tensor | None:
@@ -177,17 +171,16 @@ class TiNeuVoxField:
 
     def _placed(self, points: Tensor) -> Tensor:
         """``[PE(x), tau]`` (P, I)."""
-        position = positional_encoding(points, self.method.octaves[0])
-        return torch.cat([position, self.tau.expand(len(points), -1)], -1)
+        return torch.cat([self.method.position(points), self.tau.expand(len(points), -1)], -1)
 
     def look_up(self, points: Tensor) -> tuple[Tensor, Callable[[Tensor | slice, Tensor], Tensor]]:
         """See ``PointField``."""
         method, placed = self.method, self._placed(points)
-        read = positional_encoding(method.read(points + method.offsets(placed)), method.octaves[2])
+        read = method.feature(method.read(points + method.offsets(placed)))
         hidden = method.head.trunk(torch.cat([read, placed], -1))
 
         def color(rows: Tensor | slice, directions: Tensor) -> Tensor:
-            condition = positional_encoding(directions, method.octaves[3])
+            condition = method.direction(directions)
             if self.camera is not None:
                 condition = torch.cat([condition, self.camera.expand(len(directions), -1)], -1)
             return method.head.color(hidden[rows], condition)

@@ -10,6 +10,7 @@ import importlib.util
 import math
 import os
 import threading
+from collections.abc import Callable
 from functools import cache
 from typing import Any
 
@@ -68,6 +69,15 @@ def match_threads() -> int:
 def is_number(value: Any) -> bool:
     """Return whether a value, as a config may hold any, is a finite number; true and false are none."""
     return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+
+
+def check_value(key: str, given: Any, wanted: str, good: Callable[[Any], bool], advice: str = "") -> None:
+    """Raise ValueError unless a value is ``good``: name its key, what is wanted, what came, what to do.
+
+    >>> check_value("model.width", 2, "a number > 0", lambda number: number > 0)
+    """
+    if not good(given):
+        raise ValueError(f"{key}: expected {wanted}, but got {given!r}" + (f"; {advice}" if advice else ""))
 
 
 def check_shape(name: str, tensor: Tensor, shape: tuple[int | str, ...]) -> None:

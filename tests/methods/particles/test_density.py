@@ -6,14 +6,13 @@ from dataclasses import replace
 import pytest
 import torch
 
-from forewarp.data.module import SceneDataModule
 from forewarp.methods.effect import switched
 from forewarp.methods.particles import density
 from forewarp.methods.particles.density import _product, _quaternions, come_to_rest, renew, too_near
 from forewarp.methods.rows import take_rows
 from forewarp.ops.gaussians import moved, rotations
 from forewarp.scene.frame import sightings
-from tests.support.particles import BARE, EVERY, look, module_with, small_data
+from tests.support.particles import BARE, EVERY, data_of, look, module_with, small_data
 
 DATA = small_data()
 SOME = torch.tensor([0, 1, 3, 4, 5, 6, 8, 9])
@@ -196,10 +195,7 @@ def test_what_rests_keeps_resting_through_steps_and_density_control(half):
 
 
 def test_what_is_beyond_the_box_rests_without_a_node_and_may_be_large():
-    scene = replace(DATA.scene, has_alpha=False)
-    data = SceneDataModule(lambda: scene, rays=1)
-    data.setup("fit")
-    module = module_with(data, numbers={"shell": 4.0})
+    module = module_with(data_of(replace(DATA.scene, has_alpha=False)), numbers={"shell": 4.0})
     method, optimizer = module.method, module.configure_optimizers()
     beyond = method.beyond(method.means.data)
     assert 0 < int(beyond.sum()) < len(beyond)
@@ -223,8 +219,7 @@ def test_what_masks_say_rests_in_a_film_follows_no_node(share):
     moves[: height // 2], rests[-round(share * height) :] = True, True
     masks = {"load_moving": lambda: moves, "load_resting": lambda: rests}
     scene = replace(DATA.scene, train=tuple(replace(frame, **masks) for frame in DATA.scene.train))
-    data = SceneDataModule(lambda: scene, rays=1)
-    data.setup("fit")
+    data = data_of(scene)
     assert module_with(data).method.resting is None
     method = module_with(data, numbers={"rest_by_masks": True}).method
     assert not switched(method)["background"]
@@ -237,9 +232,8 @@ def test_what_masks_say_rests_in_a_film_follows_no_node(share):
     assert bool(method.resting.any()) == (share == 0.9)
     assert int(method.skinning.shares[method.resting].count_nonzero()) == 0
     scene = replace(scene, train=tuple(replace(frame, load_moving=None) for frame in scene.train))
-    data = SceneDataModule(lambda: scene, rays=1)  # nothing is known to move
-    data.setup("fit")
-    assert bool(module_with(data, numbers={"rest_by_masks": True}).method.resting.any()) == (share == 0.9)
+    method = module_with(data_of(scene), numbers={"rest_by_masks": True}).method  # nothing is known to move
+    assert bool(method.resting.any()) == (share == 0.9)
 
 
 @pytest.mark.parametrize(("covered", "least"), [(1e6, 0.02), (100.0, 0.5013)])

@@ -7,14 +7,13 @@ from functools import partial
 import pytest
 import torch
 
-from forewarp.data.module import SceneDataModule
 from forewarp.methods.particles.exposure import basis_at, count_of, gain_and_bias, lit, to_unlit
 from forewarp.methods.particles.model import Particles
 from forewarp.metrics.image import psnr
 from forewarp.scene.view import Moment, View
 from tests.contract.fitting import run_of, stage_of
 from tests.contract.table import METHODS, RATES
-from tests.support.particles import BARE, MOVING, module_with, shaken, small_data
+from tests.support.particles import BARE, MOVING, data_of, module_with, shaken, small_data
 from tests.support.tiny_scene import ball_scene
 
 
@@ -35,9 +34,7 @@ def drifting():
     """A scene of a moving ball, with an exposure that drifts."""
     scene = ball_scene(frames=16, size=20)
     parts = {name: tuple(map(filmed, getattr(scene, name))) for name in ("train", "test")}
-    data = SceneDataModule(lambda: replace(scene, **parts), rays=1)
-    data.setup("fit")
-    return data
+    return data_of(replace(scene, **parts))
 
 
 def fitted(data, folder, **options):

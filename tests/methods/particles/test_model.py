@@ -6,7 +6,6 @@ import pytest
 import torch
 
 from forewarp.data.batches import composited
-from forewarp.data.module import SceneDataModule
 from forewarp.methods.effect import switched
 from forewarp.methods.method import Start
 from forewarp.methods.particles import model
@@ -17,7 +16,7 @@ from tests.contract.fitting import Losses, run_of, stage_of
 from tests.contract.table import METHODS
 from tests.stability.report import BACKENDS, implementation
 from tests.support.elsewhere import GPU, Elsewhere
-from tests.support.particles import BARE, EVERY, FACTORS, look, module_with, shaken, small_data
+from tests.support.particles import BARE, EVERY, FACTORS, data_of, look, module_with, shaken, small_data
 
 DATA = small_data()
 
@@ -81,12 +80,7 @@ def test_image_losses_are_weighted_with_the_photo_term():
     shaken(module).method.nodes.seen_times.copy_(torch.tensor([0.0, 1.0]))
     for factors in ({"photo": 1.0}, {"dssim": 1.0}, {"photo": 2.0, "dssim": 0.5}):
         steps.append(look(module, DATA, 3, factors))
-    assert (
-        steps[0].terms.pop("depth")()
-        is steps[1].terms.pop("depth")()
-        is steps[2].terms.pop("depth")()
-        is None
-    )
+    assert all(step.terms.pop("depth")() is None for step in steps)
     photo, dssim, both = ({name: float(value()) for name, value in step.terms.items()} for step in steps)
     assert (both["photo"], both["dssim"]) == pytest.approx((photo["photo"], dssim["dssim"]), rel=1e-5)
     assert dssim["dssim"] > 0.01
@@ -102,13 +96,13 @@ def test_images_are_smaller_at_first(monkeypatch):
     module, made, sizes = module_with(DATA, numbers=scales), [], {}
     smaller = model.Observation.smaller
     monkeypatch.setattr(model.Observation, "smaller", lambda seen, by: made.append(by) or smaller(seen, by))
-    compared = model.compare
-    monkeypatch.setattr(
-        model,
-        "compare",
-        lambda *args, **keys: sizes.setdefault(of[0], len(args[5])) and compared(*args, **keys),
-    )
-    losses = []
+    losses, compared = [], model.compare
+
+    def compare(*args, **keys):
+        sizes[of[0]] = len(args[5])
+        return compared(*args, **keys)
+
+    monkeypatch.setattr(model, "compare", compare)
     for progress in (0.0, 0.4, 0.5, 0.9):
         of = [progress]
         module.method.progress = progress
@@ -131,12 +125,9 @@ def with_depth(data, shown=slice(None)):
         depth = (frame.load()[..., 3] > 127) * 4.0
         return lambda: torch.stack([depth, torch.ones_like(depth)])
 
-    train = [
-        replace(f, load_sensed=measured(f)) if i in range(99)[shown] else f for i, f in enumerate(scene.train)
-    ]
-    data = SceneDataModule(lambda: replace(scene, train=tuple(train)), rays=1)
-    data.setup("fit")
-    return data
+    train = list(scene.train)
+    train[shown] = [replace(frame, load_sensed=measured(frame)) for frame in train[shown]]
+    return data_of(replace(scene, train=tuple(train)))
 
 
 @pytest.mark.parametrize("beside", [{}, {"dssim": 0.3}])
@@ -199,9 +190,7 @@ def test_an_effect_that_is_off_is_absent_and_the_others_are_there(effect):
 @pytest.mark.parametrize(("options", "counts"), [(BARE, (1, 1, 1, 0, 1)), (EVERY, (6, 3, 6, 2, 3))])
 def test_operators_get_nothing_of_what_is_off(monkeypatch, options, counts):
     seen, compare = [], model.compare
-    monkeypatch.setattr(
-        model, "compare", lambda *given, **named: seen.append(given) or compare(*given, **named)
-    )
+    monkeypatch.setattr(model, "compare", lambda *args, **keys: seen.append(args) or compare(*args, **keys))
     look(module_with(DATA, **options), DATA)
     particles, warp, _, color_basis, opacity_basis, *_ = seen[0]
     found = particles.colors.shape[1], particles.opacity.shape[1], warp.links.shape[1]
@@ -220,10 +209,9 @@ def test_rates_of_lengths_are_of_the_scenes_extent():
     optimizer, extent = module.configure_optimizers(), float(module.method.extent)
     before = {g["name"]: g["lr"] for g in optimizer.param_groups}
     module.method.advance(0.5, 0, optimizer)
-    changed = {g["name"]: g["lr"] / before[g["name"]] for g in optimizer.param_groups}
-    assert {name: factor for name, factor in changed.items() if factor != 1} == pytest.approx(
-        {"means": extent, "node_translations": extent, "skinning": len(DATA.scene.train) / 100}
-    )
+    factors = {g["name"]: g["lr"] / before[g["name"]] for g in optimizer.param_groups}
+    expected = {"means": extent, "node_translations": extent, "skinning": len(DATA.scene.train) / 100}
+    assert factors == pytest.approx(dict.fromkeys(before, 1.0) | expected)
 
 
 def test_what_stands_right_before_a_camera_is_to_go():
@@ -275,10 +263,8 @@ def test_a_stage_and_its_queries_stay_on_their_device():
             drawn = snapshot.render(view, torch.ones(3))
             assert {part.device for part in vars(drawn).values()} == {GPU}
         points, times = torch.zeros(5, 3), torch.tensor([0.2, 0.8])
-        found = [
-            method.trajectories(points.to("cuda"), times.to("cuda")),
-            *method.movement([0.1, 0.9]).values(),
-        ]
+        found = [method.trajectories(points.to("cuda"), times.to("cuda"))]
+        found += method.movement([0.1, 0.9]).values()
         for cloud in (method.matter(), method.ellipsoids(0.3), method.template()):
             found += [part for part in vars(cloud).values() if isinstance(part, torch.Tensor)]
         assert {part.device for part in found} == {GPU}

@@ -1,8 +1,11 @@
 """Effects, and the numbers of a stage."""
 
+import re
+
 import pytest
 from omegaconf import OmegaConf
 
+from forewarp.methods.particles import options
 from forewarp.methods.particles.model import Particles
 from forewarp.methods.particles.options import EFFECTS, Effects, Numbers
 from tests.support.configs import composed
@@ -29,50 +32,41 @@ def test_numbers_follow_the_images():
     assert numbers.motion(100, 2)[1] == 4
     assert numbers.motion(20_000, 200)[0] > numbers.motion(5_000, 200)[0]
     decaying = Numbers(opacity_decay=0.1, crowd_decay=0.5)
-    assert [decaying.decay(8.0, covered) for covered in (2.0, 8.0, 16.0)] == pytest.approx(
-        [1 - 0.9 * (1 - 0.375), 0.1, 0.1]
-    )
+    decays = [decaying.decay(8.0, covered) for covered in (2.0, 8.0, 16.0)]
+    assert decays == pytest.approx([1 - 0.9 * (1 - 0.375), 0.1, 0.1])
 
 
-@pytest.mark.parametrize(
-    ("made", "changes", "message"),
-    [
-        (Effects, {"view_dependence": 4}, "model.view_dependence: expected a degree of 1 to 3, or null"),
-        (Effects, {"color_over_time": 0}, "model.color_over_time: expected a number of cosines >= 1"),
-        (Effects, {"rotation": False}, "or null, but got False; choose model/rotation=none to switch it off"),
-        (
-            Effects,
-            {"motion": "wobble"},
-            "model.motion: expected spline or cosines, or null, but got 'wobble'",
-        ),
-        (Effects, {"background": 0}, "model.background: expected a number > 0, or null, but got 0"),
-        (
-            Numbers,
-            {"effects": ["glow"]},
-            r"stage.fine.effects: expected some of motion, .*but got \['glow'\]",
-        ),
-        (
-            Numbers,
-            {"initial_share": 0.0},
-            r"stage.fine.initial_share: expected a number in \(0, 1\], but got 0",
-        ),
-        (Numbers, {"density": -1.0}, "stage.fine.density: expected a number > 0, but got -1.0"),
-        (Numbers, {"edges": 0}, "stage.fine.edges: expected a whole number >= 1, but got 0"),
-        (
-            Numbers,
-            {"opacity_decay": 1},
-            r"stage.fine.opacity_decay: expected a number in \[0, 1\), but got 1",
-        ),
-        (Numbers, {"jitter": "some"}, "stage.fine.jitter: expected a number >= 0, but got 'some'"),
-        (Numbers, {"shell": 0.5}, "stage.fine.shell: expected 0 or a number >= 1, but got 0.5"),
-        (
-            Numbers,
-            {"image_scale": [[0.5, 2]]},
-            r"stage.fine.image_scale: expected \[\[0, count\], .*, but got \[\[0.5, 2\]\]",
-        ),
-        (Numbers, {"natural_splines": 1}, "stage.fine.natural_splines: expected true or false, but got 1"),
-    ],
-)
-def test_wrong_choices_are_refused(made, changes, message):
-    with pytest.raises(ValueError, match=message):
-        made(**changes)
+COSINES, FORM = "a number of cosines >= 1", "[[0, count], [fraction, count], ...] with ascending fractions"
+WRONG_EFFECTS = [
+    ("view_dependence", 4, "a degree of 1 to 3"),
+    ("color_over_time", 0, COSINES),
+    ("rotation", False, "true"),
+    ("motion", "wobble", "spline or cosines"),
+    ("background", 0, "a number > 0"),
+]
+WRONG_NUMBERS = [
+    ("effects", ["glow"], f"some of {', '.join(options.NAMES)}"),
+    ("initial_share", 0.0, "a number in (0, 1]"),
+    ("density", -1.0, "a number > 0"),
+    ("edges", 0, "a whole number >= 1"),
+    ("opacity_decay", 1, "a number in [0, 1)"),
+    ("jitter", "some", "a number >= 0"),
+    ("shell", 0.5, "0 or a number >= 1"),
+    ("image_scale", [[0.5, 2]], f"{FORM} and counts >= 1"),
+    ("natural_splines", 1, "true or false"),
+]
+
+
+@pytest.mark.parametrize(("key", "wrong", "wanted"), WRONG_EFFECTS)
+def test_wrong_effects_are_refused(key, wrong, wanted):
+    off = f"choose model/{key}=none to switch it off"
+    message = f"model.{key}: expected {wanted}, or null, but got {wrong!r}; {off}"
+    with pytest.raises(ValueError, match=f"^{re.escape(message)}$"):
+        Effects(**{key: wrong})
+
+
+@pytest.mark.parametrize(("key", "wrong", "wanted"), WRONG_NUMBERS)
+def test_wrong_numbers_are_refused(key, wrong, wanted):
+    message = f"stage.fine.{key}: expected {wanted}, but got {wrong!r}"
+    with pytest.raises(ValueError, match=f"^{re.escape(message)}$"):
+        Numbers(**{key: wrong})

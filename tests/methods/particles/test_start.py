@@ -10,17 +10,6 @@ import torch
 
 from forewarp.methods.method import Start
 from forewarp.methods.particles import start
-from forewarp.methods.particles.start import (
-    _in_holes,
-    covered_pixels,
-    first_points,
-    first_values,
-    hull_surface,
-    measured,
-    seen_colors,
-    swept,
-    widths,
-)
 from forewarp.ops.backend import numba_installed
 from forewarp.scene.camera import Camera, Lens
 from forewarp.scene.cloud import Cloud, Handover
@@ -51,7 +40,7 @@ def inside(points, box):
 
 def test_the_hull_is_around_the_ball(scene_of):
     scene = scene_of("nhr")  # several cameras a time
-    cloud = hull_surface(scene, [i for i, f in enumerate(scene.train) if f.time == 0.0], 400)
+    cloud = start.hull_surface(scene, [i for i, f in enumerate(scene.train) if f.time == 0.0], 400)
     away = (cloud.points - ball_center(0.0)).norm(dim=-1)
     assert len(cloud) == 400
     assert 0.8 * RADIUS < float(away.median()) < 1.5 * RADIUS
@@ -61,14 +50,14 @@ def test_the_hull_is_around_the_ball(scene_of):
 
 def test_a_sweep_looks_at_neighbours_in_time_and_keeps_known_points(scene_of):
     scene = scene_of("hypernerf")
-    cloud = swept(scene, [], 400)
+    cloud = start.swept(scene, [], 400)
     assert len(cloud) > 16
     assert inside(cloud.points, scene.box)
     known = cloud.points[:50]
-    cloud = swept(replace(scene, still=known), [], 400)
+    cloud = start.swept(replace(scene, still=known), [], 400)
     cameras, images = [f.camera for f in scene.train], [f.load() for f in scene.train]
     assert torch.equal(cloud.points[:50], known)
-    torch.testing.assert_close(cloud.colors[:50], seen_colors(known, cameras, images))
+    torch.testing.assert_close(cloud.colors[:50], start.seen_colors(known, cameras, images))
     assert float((cloud.colors[:50] - 0.5).abs().max()) > 0.05
 
     def unread():
@@ -77,30 +66,29 @@ def test_a_sweep_looks_at_neighbours_in_time_and_keeps_known_points(scene_of):
     around = [scene.train[i % len(scene.train)] for i in range(10)]
     now = [replace(frame, time=0.5, camera_id=i) for i, frame in enumerate(around)]
     other = [replace(frame, time=t, camera_id=0, load=unread) for frame in around for t in (0.4, 0.6)]
-    assert (
-        len(swept(replace(scene, train=(*other, *now)), list(range(len(other), len(other) + 10)), 400)) > 16
-    )
+    after = list(range(len(other), len(other) + 10))
+    assert len(start.swept(replace(scene, train=(*other, *now)), after, 400)) > 16
     with pytest.raises(AssertionError, match="another time"):
-        swept(replace(scene, train=(*other, *now[:8])), list(range(len(other), len(other) + 8)), 400)
+        start.swept(replace(scene, train=(*other, *now[:8])), after[:8], 400)
 
 
 def test_a_sweep_of_images_of_one_row(scene_of):
     scene = scene_of("hypernerf")
     strip = torch.zeros(1, 1000, 4, dtype=torch.uint8)
     narrow = [replace(f, camera=f.camera.resized(1000, 1), load=lambda: strip) for f in scene.train[:3]]
-    cloud = swept(replace(scene, train=tuple(narrow)), [], 400)
+    cloud = start.swept(replace(scene, train=tuple(narrow)), [], 400)
     assert cloud is None or inside(cloud.points, scene.box)
 
 
 def test_points_lie_beyond_the_box_where_there_is_a_shell(scene_of):
     scene = scene_of("hypernerf")
-    cloud = swept(scene, [], 400, shell=4.0)
+    cloud = start.swept(scene, [], 400, shell=4.0)
     low, high = torch.tensor(scene.box.low), torch.tensor(scene.box.high)
     beyond = ((cloud.points < low) | (cloud.points > high)).any(-1)
     assert 0 < int(beyond.sum()) < len(cloud)
     for frame in scene.train:  # hardly a ray goes past all
         rays = frame.camera.rays()
-        holes = _in_holes(cloud.points, rays.origins + rays.directions, frame.camera, 5)
+        holes = start._in_holes(cloud.points, rays.origins + rays.directions, frame.camera, 5)
         assert float(holes.float().mean()) < 0.1
 
 
@@ -110,9 +98,9 @@ def test_an_image_of_a_sweep_fills_only_its_holes(scene_of):
     column = torch.arange(320) % 20
     there = (rays.origins + 3.0 * rays.directions)[column < 12]
     for depth in (1.0, 5.0):  # before what is there, and behind it
-        fills = _in_holes(there, rays.origins + depth * rays.directions, camera, 5)
+        fills = start._in_holes(there, rays.origins + depth * rays.directions, camera, 5)
         assert torch.equal(fills, column >= 12)
-    assert bool(_in_holes(torch.zeros(0, 3), there, camera, 5).all())
+    assert bool(start._in_holes(torch.zeros(0, 3), there, camera, 5).all())
 
 
 def test_the_lens_of_an_image_that_is_swept_is_undone():
@@ -146,38 +134,36 @@ def before_wall(scene, times, ball=lambda time: time, known=lambda depth: depth 
 
 def test_particles_begin_at_measured_depths_and_at_what_was_hidden_behind(scene_of):
     scene = before_wall(scene_of("hypernerf"), [0.0, 1.0])
-    cloud = measured(scene, 300)
+    cloud = start.measured(scene, 300)
     near = cloud.points[:, 2] < 3
-    torch.testing.assert_close(cloud.points[near, 2], torch.full((int(near.sum()),), 2.0), atol=1e-4, rtol=0)
-    torch.testing.assert_close(
-        cloud.points[~near, 2], torch.full((int((~near).sum()),), 4.0), atol=1e-4, rtol=0
-    )
+    depth = torch.where(near, 2.0, 4.0)
+    torch.testing.assert_close(cloud.points[:, 2], depth, atol=1e-4, rtol=0)
     columns = torch.stack([scene.train[0].camera.project(cloud.points)[0][:, 0], near.float()])
     assert columns[0][near].max() < 10  # where it stood at the canonical time alone
     assert (columns[0][~near] < 10).sum() == near.sum()  # and the wall that it hid then
     assert cloud.colors[near].max() < 0.5 < cloud.colors[~near].min()
     scene = before_wall(scene_of("hypernerf"), [0.0], known=lambda depth: depth < 3)
-    assert (measured(scene, 300).points[:, 2] < 3).all()
-    doubted = replace(
-        scene.train[0], load_sensed=lambda: torch.stack([torch.ones(20, 40), torch.full((20, 40), 0.1)])
-    )
-    assert measured(replace(scene, train=(doubted,)), 300) is None
-    assert measured(scene_of("hypernerf"), 300) is None
+    assert (start.measured(scene, 300).points[:, 2] < 3).all()
+    unsure = torch.stack([torch.ones(20, 40), torch.full((20, 40), 0.1)])
+    doubted = replace(scene.train[0], load_sensed=lambda: unsure)
+    assert start.measured(replace(scene, train=(doubted,)), 300) is None
+    assert start.measured(scene_of("hypernerf"), 300) is None
 
 
 def test_what_a_stage_left_comes_first_and_random_points_last(scene_of):
     scene = scene_of("dnerf")
     left = Cloud(torch.rand(100, 3), torch.rand(100, 3), torch.ones(100), 0.1)
     begun = Start(scene, "fine", {}, [0, 1], Handover(scene.box, True, 6, left))
-    assert torch.equal(first_points(begun, 1000).points, left.points)
-    assert len(first_points(begun, 30)) == 30
+    assert torch.equal(start.first_points(begun, 1000).points, left.points)
+    assert len(start.first_points(begun, 30)) == 30
     alone = replace(scene, train=scene.train[:1], has_alpha=False)
-    assert inside(first_points(Start(alone, "fine", {}, [0]), 50).points, scene.box)
-    assert covered_pixels(scene, [0]) == int((scene.train[0].load()[..., 3] > 127).sum())
+    assert inside(start.first_points(Start(alone, "fine", {}, [0]), 50).points, scene.box)
+    assert start.covered_pixels(scene, [0]) == int((scene.train[0].load()[..., 3] > 127).sum())
 
 
 def values_of(points, widest=None, size=1.0):
-    return first_values(Cloud(points, torch.full_like(points, 0.75), torch.ones(len(points)), size), widest)
+    cloud = Cloud(points, torch.full_like(points, 0.75), torch.ones(len(points)), size)
+    return start.first_values(cloud, widest)
 
 
 def test_particles_begin_round_and_no_larger_than_they_are_apart(scene_of):
@@ -191,7 +177,7 @@ def test_particles_begin_round_and_no_larger_than_they_are_apart(scene_of):
     camera = scene.train[0].camera
     points = camera.center.float() - 2.0 * camera.camera_to_world[:3, 2].float() + 0.1 * torch.rand(50, 3)
     away = torch.stack([(points - f.camera.center.float()).norm(dim=-1) for f in scene.train]).amin(0)
-    widest = widths(scene, points, 200.0)
+    widest = start.widths(scene, points, 200.0)
     torch.testing.assert_close(widest, away / camera.fx * 2.0)  # 200 pixels for 50 points: 2 pixels apart
     far, near = (values_of(points * scale, widest)["scales"].exp() for scale in (100, 1e-3))
     torch.testing.assert_close(far, widest[:, None].expand(-1, 3))

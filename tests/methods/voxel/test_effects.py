@@ -7,23 +7,7 @@ import torch
 
 from forewarp.fields.curves import TrajectoryField
 from forewarp.fields.grids import EMPTY, Activation, RadianceGrid
-from forewarp.methods.voxel.effects import (
-    ConvBlock,
-    Crop,
-    LearnedUpsampler,
-    Motion,
-    SphericalHarmonics,
-    Together,
-    TrilinearUpsampler,
-    ViewNetwork,
-    convolve,
-    densify,
-    interpolate_dense,
-    occupied_crop,
-    overlapped,
-    refined,
-    sparsify,
-)
+from forewarp.methods.voxel import effects
 from forewarp.ops.grid import index_of
 from forewarp.ops.splat import average_splat
 from forewarp.renderer import Renderer
@@ -45,7 +29,7 @@ def grid_of(lattice, voxels, values=None, activation=ACTIVATION):
 
 
 def motion(**changes):
-    return Motion(TrajectoryField(BOX, bases=2, frames=5, canonical_time=0.0, nodes=8), **changes)
+    return effects.Motion(TrajectoryField(BOX, bases=2, frames=5, canonical_time=0.0, nodes=8), **changes)
 
 
 def solid():
@@ -114,24 +98,24 @@ CROPPED = Lattice(Box((0, 0, 0), (4, 5, 6)), (5, 6, 7))
 )
 def test_the_crop_holds_all_voxels_and_at_least_two_an_axis(voxels, margin, low, high):
     index = index_of(torch.tensor(voxels, dtype=torch.long).reshape(-1, 3), CROPPED.shape)
-    assert occupied_crop(index, margin) == Crop(low, high)
+    assert effects.occupied_crop(index, margin) == effects.Crop(low, high)
 
 
 def test_dense_and_back():
     sparse = grid_of(CROPPED, torch.tensor([(1, 2, 3), (2, 2, 5)]), torch.arange(8.0).reshape(2, 4))
-    crop = occupied_crop(sparse.index, 1)
-    dense = densify(sparse, crop)
+    crop = effects.occupied_crop(sparse.index, 1)
+    dense = effects.densify(sparse, crop)
     assert dense.shape == (1, 4, *crop.shape) == (1, 4, 4, 3, 5)
     assert dense[0, :, 1, 1, 1].tolist() == [0, 1, 2, 3]
     assert dense[0, :, 2, 1, 3].tolist() == [4, 5, 6, 7]
     assert int((dense[0, 0] == EMPTY).sum()) == 4 * 3 * 5 - 2
-    back = sparsify(sparse, CROPPED, crop, dense)
+    back = effects.sparsify(sparse, CROPPED, crop, dense)
     assert int((back.index >= 0).sum()) == 60
     assert back.values[back.index[sparse.index >= 0].long()].equal(sparse.values)
 
 
 def test_a_voxel_alone_is_not_normalised():
-    block = ConvBlock(2, 3)
+    block = effects.ConvBlock(2, 3)
     alone, doubled = torch.randn(1, 2, 1, 1, 1), torch.randn(1, 2, 2, 1, 1)
     torch.testing.assert_close(block(alone), torch.relu(block.conv(alone)))
     torch.testing.assert_close(block(doubled), torch.relu(block.conv(block.norm(doubled))))
@@ -142,7 +126,7 @@ def test_the_convolution_of_one_thread_is_the_layers_own(size):
     layer = torch.nn.Conv3d(16, 16, 3, padding=1)
     x = torch.randn(1, 16, *size).to(memory_format=torch.channels_last_3d).requires_grad_()
     weights = torch.randn(1, 16, *size)
-    found = torch.autograd.grad((convolve(layer, x) * weights).sum(), [x, *layer.parameters()])
+    found = torch.autograd.grad((effects.convolve(layer, x) * weights).sum(), [x, *layer.parameters()])
     exact = layer.double()
     wanted = torch.autograd.grad((exact(x.double()) * weights).sum(), [x, *exact.parameters()])
     for ours, theirs in zip(found, wanted, strict=True):
@@ -154,7 +138,7 @@ def test_one_thread_takes_the_fast_convolution_too(monkeypatch, threads):
     layer, x, taken = torch.nn.Conv3d(16, 16, 3, padding=1), torch.randn(1, 16, 8, 8, 8), []
     monkeypatch.setattr(torch.nn.functional, "conv3d", lambda x, *_, **__: taken.append(x.is_mkldnn) or x)
     monkeypatch.setattr(torch, "get_num_threads", lambda: threads)
-    convolve(layer, x)
+    effects.convolve(layer, x)
     assert taken == [threads == 1 and torch.backends.mkldnn.is_available()]
 
 
@@ -164,12 +148,12 @@ CORNER = torch.cartesian_prod(torch.arange(2), torch.arange(1, 3), torch.tensor(
 
 
 def test_interpolation_in_occupied_cells_equals_that_of_the_whole_box():
-    assert refined(COARSE, 1.5).shape == (4, 5, 7)
+    assert effects.refined(COARSE, 1.5).shape == (4, 5, 7)
     coarse = grid_of(COARSE, CORNER)
-    crop = occupied_crop(coarse.index, 9)
-    dense = interpolate_dense(densify(coarse, crop), crop, 2)
-    whole = sparsify(coarse, refined(COARSE, 2), crop.scaled(2), dense)
-    fine = TrilinearUpsampler(scale=2)(coarse)
+    crop = effects.occupied_crop(coarse.index, 9)
+    dense = effects.interpolate_dense(effects.densify(coarse, crop), crop, 2)
+    whole = effects.sparsify(coarse, effects.refined(COARSE, 2), crop.scaled(2), dense)
+    fine = effects.TrilinearUpsampler(scale=2)(coarse)
     assert len(fine.values) < len(whole.values)
     points = torch.rand(50, 3, generator=torch.Generator().manual_seed(1)) * torch.tensor([4.0, 6.0, 8.0])
     torch.testing.assert_close(fine.density(points), whole.density(points), atol=1e-5, rtol=1e-4)
@@ -180,11 +164,11 @@ def test_interpolation_in_occupied_cells_equals_that_of_the_whole_box():
 
 @pytest.mark.parametrize("voxels", [FULL, CORNER])
 def test_the_learned_layer_starts_as_plain_interpolation_to_the_bit(voxels):
-    coarse, learned = grid_of(COARSE, voxels), LearnedUpsampler(scale=2, channels=4)
-    crop = occupied_crop(coarse.index, learned.margin)
-    plain = interpolate_dense(densify(coarse, crop), crop, 2)
+    coarse, learned = grid_of(COARSE, voxels), effects.LearnedUpsampler(scale=2, channels=4)
+    crop = effects.occupied_crop(coarse.index, learned.margin)
+    plain = effects.interpolate_dense(effects.densify(coarse, crop), crop, 2)
     fine = learned(coarse)
-    assert torch.equal(fine.values, sparsify(coarse, fine.lattice, crop.scaled(2), plain).values)
+    assert torch.equal(fine.values, effects.sparsify(coarse, fine.lattice, crop.scaled(2), plain).values)
     fine.values.sum().backward()
     assert learned.head.weight.grad.abs().sum() > 0
 
@@ -192,7 +176,7 @@ def test_the_learned_layer_starts_as_plain_interpolation_to_the_bit(voxels):
 def stepped(recompute):
     """Detail, every gradient, and the bytes that the backward pass held, of a layer that has learned."""
     torch.manual_seed(0)
-    learned = LearnedUpsampler(scale=2, channels=4, width=8, features=6, recompute=recompute)
+    learned = effects.LearnedUpsampler(scale=2, channels=4, width=8, features=6, recompute=recompute)
     torch.nn.init.normal_(learned.head.weight)
     features, held = torch.randn(1, 6, *COARSE.shape, requires_grad=True), {}
 
@@ -201,7 +185,7 @@ def stepped(recompute):
         return kept
 
     with torch.autograd.graph.saved_tensors_hooks(hold, lambda kept: kept):
-        detail = learned.residual(features, occupied_crop(grid_of(COARSE, FULL).index, 0))
+        detail = learned.residual(features, effects.occupied_crop(grid_of(COARSE, FULL).index, 0))
     detail.square().sum().backward()
     return [detail.detach(), features.grad, *(p.grad for p in learned.parameters())], sum(held.values())
 
@@ -218,11 +202,11 @@ def test_harmonics_hand_worked():
     features = torch.zeros(1, 12)
     features[0, :3] = torch.tensor([0.1, 0.2, 0.3])
     features[0, 3:] = torch.eye(3).flatten()  # with y: red, with z: green, with x: blue
-    color = SphericalHarmonics()(features, torch.tensor([[0.6, 0.8, -0.5]]))
+    color = effects.SphericalHarmonics()(features, torch.tensor([[0.6, 0.8, -0.5]]))
     torch.testing.assert_close(color, torch.sigmoid(torch.tensor([[0.1 + 0.8, 0.2 - 0.5, 0.3 + 0.6]])))
 
 
-@pytest.mark.parametrize("view", [SphericalHarmonics(), ViewNetwork(features=12, width=4)])
+@pytest.mark.parametrize("view", [effects.SphericalHarmonics(), effects.ViewNetwork(features=12, width=4)])
 def test_colours_lie_in_the_unit_cube_and_have_gradients(view):
     for samples in (0, 1, 7):
         directions = torch.nn.functional.normalize(torch.randn(samples, 3), dim=-1)
@@ -253,7 +237,7 @@ def random_points(count):
 
 def test_densities_add_colours_are_weighted_by_them_and_directions_change_only_what_moves():
     moving, still = values_on(SMALL, 1.0, (0, 1, 2), seed=3), values_on(WIDE, -1.0, (1, 0, -1), seed=4)
-    together, points = Together(moving, still), random_points(4000)
+    together, points = effects.Together(moving, still), random_points(4000)
     inner = SMALL.to_lattice(WIDE.to_world(points))
     within = ((inner >= 0) & (inner <= torch.tensor(SMALL.shape) - 1)).all(-1)
     assert 100 < within.sum() < 3900
@@ -278,7 +262,7 @@ def test_what_is_thin_and_moves_is_not_stepped_over():
     origins = torch.rand(50, 3, generator=torch.Generator().manual_seed(2), dtype=torch.float64) * 0.3 - 0.15
     origins[:, 0] = -2.0
     rays = Rays(origins, torch.tensor([[1.0, 0.0, 0.0]], dtype=torch.float64).expand(50, 3), 0.0, 5.0)
-    field = Together(moving, values_on(WIDE, -50.0, (0, 0, 0)))
+    field = effects.Together(moving, values_on(WIDE, -50.0, (0, 0, 0)))
     assert float(Renderer()(field, rays, torch.zeros(3).double()).opacity.min()) > 0.99
 
 
@@ -287,7 +271,7 @@ def test_cells_are_those_that_share_space(shape):
     source = Lattice(SMALL.box, shape)
     cells = torch.rand([n - 1 for n in shape], generator=torch.Generator().manual_seed(5)) < 0.2
     cells.view(-1)[0] = True
-    found = overlapped(cells, source, WIDE)
+    found = effects.overlapped(cells, source, WIDE)
     points = torch.rand(60_000, 3, generator=torch.Generator().manual_seed(6), dtype=torch.float64)
     inner = points * torch.tensor([n - 1 for n in shape])
     hit = cells[inner.long().unbind(-1)]
@@ -300,7 +284,7 @@ def test_cells_are_those_that_share_space(shape):
 def test_an_empty_moving_grid_leaves_the_still_one():
     still, empty = values_on(WIDE, 1.0, (0, 1, 2), seed=4), values_on(SMALL, 0.0, (0, 0, 0), voxels=FULL[:0])
     rays = Rays(*torch.tensor([[[0.1, 0.2, -3.0]], [[0.0, 0.0, 1.0]]], dtype=torch.float64), 0.0, 9.0)
-    both = Renderer()(Together(empty, still), rays, torch.ones(3).double())
+    both = Renderer()(effects.Together(empty, still), rays, torch.ones(3).double())
     same = Renderer(step=0.5 * SMALL.voxel_size / WIDE.voxel_size)  # the steps of the finer of the two
     alone = same(still, rays, torch.ones(3).double())
     torch.testing.assert_close(both.rgb, alone.rgb, atol=1e-5, rtol=0)  # an absent voxel has 1e-6 of opacity
@@ -312,6 +296,6 @@ def test_extreme_densities_stay_finite_in_values_and_gradients(raw):
     grids = values_on(SMALL, raw, (0, 1, 2)), values_on(WIDE, raw, (1, 0, -1))
     for grid in grids:
         grid.values.requires_grad_()
-    points, together = random_points(50), Together(*grids)
+    points, together = random_points(50), effects.Together(*grids)
     (together.colors(points, points, None).sum() + together.density(points).sum()).backward()
     assert all(grid.values.grad.isfinite().all() for grid in grids)

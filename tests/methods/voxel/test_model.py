@@ -1,5 +1,6 @@
 """How a voxel method is made for a stage, what it cannot be made from, and its loss terms."""
 
+import math
 from dataclasses import replace
 from functools import partial
 
@@ -18,60 +19,47 @@ from forewarp.scene.box import Lattice
 from forewarp.scene.cloud import Handover
 from forewarp.scene.view import Moment
 from forewarp.training.checkpoints import make_handover
-from tests.support.tiny_scene import (
-    BOX,
-    EVERYTHING,
-    FEATURES,
-    INPAINTER,
-    RADIANCE,
-    RADIUS,
-    backward_model,
-    ball_center,
-    ball_data,
-    ball_method,
-    ball_scene,
-    built,
-    forward_model,
-)
+from tests.support import tiny_scene as tiny
 
-LATTICE = Lattice(BOX, (5, 4, 6))
-FULL = forward_model(**EVERYTHING, trajectory=partial(TrajectoryField, bases=3, nodes=8, features=2))
+LATTICE = Lattice(tiny.BOX, (5, 4, 6))
+TRAJECTORY = partial(TrajectoryField, bases=3, nodes=8, features=2)
+FULL = tiny.forward_model(**tiny.EVERYTHING, trajectory=TRAJECTORY)
 
 
 @pytest.mark.parametrize("effect", NAMES)
 def test_a_stage_uses_the_effects_that_it_names(effect):
-    method = built(FULL, LATTICE, effects=[effect])
+    method = tiny.built(FULL, LATTICE, effects=[effect])
     assert {name for name in NAMES if getattr(method, name) is not None} == {effect}
 
 
 def test_a_stage_may_interpolate_instead():
-    upsampler = built(FULL, LATTICE, effects=["motion"], upsample=1.5).upsampler
+    upsampler = tiny.built(FULL, LATTICE, effects=["motion"], upsample=1.5).upsampler
     assert (type(upsampler), upsampler.scale) == (TrilinearUpsampler, 1.5)
 
 
-SCENE = ball_scene(frames=6, size=16)
+SCENE = tiny.ball_scene(frames=6, size=16)
 
 
 def fresh(model=None, scene=SCENE, frames=range(6), **numbers):
     """The method of a first stage."""
     numbers = {"num_voxels": [[0, 1500]]} | numbers
-    return (model or forward_model())(Start(scene, "coarse", numbers, list(frames)))
+    return (model or tiny.forward_model())(Start(scene, "coarse", numbers, list(frames)))
 
 
 def carried(before, handover, model=None, **numbers):
     """The method of a stage after another."""
     numbers = {"num_voxels": [[0, 1500]]} | numbers
-    return (model or forward_model())(Start(SCENE, "fine", numbers, range(6), handover, before))
+    return (model or tiny.forward_model())(Start(SCENE, "fine", numbers, range(6), handover, before))
 
 
 def left(method):
     """What a stage of this method leaves where all of the box is full."""
-    return Handover(BOX, True, 6, notes=method.notes())
+    return Handover(tiny.BOX, True, 6, notes=method.notes())
 
 
-@pytest.mark.parametrize("radiance", [RADIANCE, FEATURES], ids=["voxels", "network"])
+@pytest.mark.parametrize("radiance", [tiny.RADIANCE, tiny.FEATURES], ids=["voxels", "network"])
 def test_a_fresh_method_starts_faint_everywhere(radiance):
-    method = fresh(forward_model(radiance=radiance), start_alpha=0.03)
+    method = fresh(tiny.forward_model(radiance=radiance), start_alpha=0.03)
     lattice, grid = method.radiance.lattice, method.radiance()
     assert method.notes() == {"density_scale": lattice.voxel_size}
     alpha = grid.activation.alpha(grid.raw_density, lattice.voxel_size)
@@ -81,7 +69,7 @@ def test_a_fresh_method_starts_faint_everywhere(radiance):
 def test_the_hull_is_where_matter_may_be():
     radiance = fresh(start="hull", hull_frames=2, hull_grow=0.1).radiance
     everywhere = radiance.lattice.to_world(radiance.lattice.all_voxels())
-    ball_now = (everywhere - ball_center(0.0)).norm(dim=-1) < 0.8 * RADIUS
+    ball_now = (everywhere - tiny.ball_center(0.0)).norm(dim=-1) < 0.8 * tiny.RADIUS
     assert (radiance.index.flatten()[ball_now] >= 0).all()
     assert len(radiance.voxels) < 0.5 * len(everywhere)
 
@@ -105,18 +93,18 @@ def test_what_only_waits_for_a_checkpoint_looks_at_no_picture():
 
     scene = replace(SCENE, train=tuple(replace(frame, load=refuse) for frame in SCENE.train))
     numbers = {"num_voxels": [[0, 1500]], "start": "hull"}
-    radiance = forward_model()(Start(scene, "fine", numbers, range(6), blank=True)).radiance
+    radiance = tiny.forward_model()(Start(scene, "fine", numbers, range(6), blank=True)).radiance
     assert len(radiance.voxels) == radiance.lattice.count
     with pytest.raises(AssertionError, match="a picture was loaded"):
         fresh(scene=scene, start="hull")
 
 
 def test_carrying_keeps_matter_motion_and_unit():
-    before = ball_method(SCENE)
+    before = tiny.ball_method(SCENE)
     unit, path = before.radiance.activation.density_scale, before.motion.trajectory.state_dict()
     handover = make_handover(before, SCENE, None, 6)
     sigma, at = before.radiance().density, before.radiance.lattice.to_lattice
-    points = ball_center(0.0) + 0.2 * (torch.rand(50, 3) - 0.5)
+    points = tiny.ball_center(0.0) + 0.2 * (torch.rand(50, 3) - 0.5)
     expected = sigma(at(points)).detach()
     after = carried(before, handover, num_voxels=[[0, 4000]])
     lattice = after.radiance.lattice
@@ -129,7 +117,7 @@ def test_carrying_keeps_matter_motion_and_unit():
 
 @pytest.mark.parametrize("nodes", [0, 8])
 def test_deformation_features_lie_at_nodes_or_voxels_and_are_carried_to_others(nodes):
-    model = forward_model(trajectory=partial(TrajectoryField, bases=3, nodes=nodes, features=2))
+    model = tiny.forward_model(trajectory=partial(TrajectoryField, bases=3, nodes=nodes, features=2))
     before = fresh(model)
     torch.nn.init.normal_(before.motion.trajectory.network[-1].weight)
     features = before.motion.trajectory.features
@@ -146,7 +134,7 @@ def test_deformation_features_lie_at_nodes_or_voxels_and_are_carried_to_others(n
 
 
 def test_carrying_into_a_stage_with_more_effects():
-    before = fresh(forward_model(view_dependence=None))
+    before = fresh(tiny.forward_model(view_dependence=None))
     before.radiance.color.data[:] = 0.5
     after = carried(before, left(before))
     assert (after.radiance.shading == 0).all()
@@ -154,7 +142,7 @@ def test_carrying_into_a_stage_with_more_effects():
 
 
 def test_a_background_that_only_the_second_stage_has_starts_faint():
-    model = forward_model(background=EVERYTHING["background"])
+    model = tiny.forward_model(background=tiny.EVERYTHING["background"])
     before = fresh(model, effects=["motion"])
     assert before.background is None
     after = carried(before, left(before), model, start_alpha=0.2)
@@ -164,7 +152,7 @@ def test_a_background_that_only_the_second_stage_has_starts_faint():
 
 
 def test_carrying_a_network():
-    model = forward_model(radiance=FEATURES)
+    model = tiny.forward_model(radiance=tiny.FEATURES)
     before = fresh(model)
     torch.nn.init.normal_(before.radiance.network[-1].weight)
     networks = (made.radiance.network.parameters() for made in (carried(before, left(before), model), before))
@@ -172,7 +160,7 @@ def test_carrying_a_network():
 
 
 def test_where_nothing_is_carried_the_box_and_the_unit_are_kept():
-    before = ball_method(SCENE)
+    before = tiny.ball_method(SCENE)
     handover = make_handover(before, SCENE, None, 6)
     radiance = carried(before, handover, carry=False).radiance
     assert radiance.lattice.box == handover.box
@@ -181,27 +169,27 @@ def test_where_nothing_is_carried_the_box_and_the_unit_are_kept():
 
 
 def test_after_a_stage_of_another_method_only_its_box_is_used():
-    box = BOX.scaled(0.5)
+    box = tiny.BOX.scaled(0.5)
     radiance = carried(torch.nn.Linear(1, 1), Handover(box, True, 6, notes={"particles": 3.0})).radiance
     assert radiance.lattice.box == box
     assert radiance.activation.density_scale == radiance.lattice.voxel_size
     assert (radiance.density == radiance.density[0]).all()
 
 
-OPAQUE = replace(ball_scene(frames=2, size=8), has_alpha=False)
-PATHS = partial(TrajectoryField, BOX, bases=2, frames=5, canonical_time=0.0, nodes=8)
-ODD = forward_model(upsampler=partial(TrilinearUpsampler, scale=1.5), inpainter=INPAINTER)
+OPAQUE = replace(tiny.ball_scene(frames=2, size=8), has_alpha=False)
+PATHS = partial(TrajectoryField, tiny.BOX, bases=2, frames=5, canonical_time=0.0, nodes=8)
+ODD = tiny.forward_model(upsampler=partial(TrilinearUpsampler, scale=1.5), inpainter=tiny.INPAINTER)
 
 
 def refusing(model=None, **numbers):
     """A call that makes the method of a first stage over opaque images."""
     start = Start(OPAQUE, "coarse", {"num_voxels": [[0, 100]]} | numbers, [0])
-    return partial(model or forward_model(), start)
+    return partial(model or tiny.forward_model(), start)
 
 
 SCHEDULE = r"stage.coarse.num_voxels: expected \[\[fraction, count\], ...\] .* but got"
 SPREADING = "stage.coarse: expected 0 < birth_alpha < keep_alpha < 1"
-SPLAT = "model.motion: expected 0 < tau <= 1, 0 <= fade <= 1 and"
+SPLAT = "model.motion.{}: expected a .* in "
 GHOST = "model.{0}: expected a factory or null, but got .*choose model/{0}=none"
 STAGES = [
     *(({"num_voxels": given}, SCHEDULE) for given in ([], [[0.5, 100], [0, 100]], 100, [[2, 9]], [[0, 0]])),
@@ -213,30 +201,22 @@ STAGES = [
     ({"box_alpha": 0.0}, r"stage.coarse.box_alpha: expected a number in \(0, 1\), but"),
     *((wrong, SPREADING) for wrong in ({"birth_alpha": 1e-2}, {"birth_alpha": 0.0}, {"keep_alpha": 1.0})),
 ]
+GHOSTLY, FACTORY = {"width": 3}, "model.deformation: expected a factory, but got"
+TRAJECTORIES = "model.trajectory: .* got None; choose another model/motion"
+SPLATS = ({"tau": 0.0}, {"tau": 2.0}, {"fade": -0.1}, {"fade": 1.5}, {"rest": 0.5})
 REFUSED = [
     *((refusing(**wrong), text) for wrong, text in STAGES),
-    *(
-        (refusing(forward_model(**{name: {"width": 3}})), GHOST.format(name))
-        for name in ("inpainter", "background")
+    *((refusing(tiny.forward_model(**{n: GHOSTLY})), GHOST.format(n)) for n in ("inpainter", "background")),
+    *((refusing(tiny.backward_model(deformation=wrong)), FACTORY) for wrong in (None, GHOSTLY)),
+    (refusing(tiny.forward_model(trajectory=None)), TRAJECTORIES),
+    *((lambda given=given: Motion(PATHS(), **given), SPLAT.format(*given)) for given in SPLATS),
+    (partial(UNet3d, channels=4, width=12), "model.inpainter.width: expected a multiple of 16, but got 12"),
+    (
+        partial(UNet3d, channels=4, levels=1),
+        "model.inpainter.levels: expected a whole number >= 2, but got",
     ),
-    *(
-        (refusing(backward_model(deformation=wrong)), "model.deformation: expected a factory, but got")
-        for wrong in (None, {"width": 3})
-    ),
-    (refusing(forward_model(trajectory=None)), "model.trajectory: .* got null; choose another model/motion"),
-    *(
-        (lambda wrong=wrong: Motion(PATHS(), **wrong), SPLAT)
-        for wrong in ({"tau": 0.0}, {"tau": 2.0}, {"fade": -0.1}, {"fade": 1.5}, {"rest": 0.5})
-    ),
-    *(
-        (partial(UNet3d, channels=4, **wrong), "model.inpainter: .* width that is a multiple of 16 and")
-        for wrong in ({"width": 12}, {"levels": 1})
-    ),
-    *(
-        (partial(TrilinearUpsampler, scale=scale), "model.upsampler.scale: expected a number > 1, but got")
-        for scale in (1, float("nan"))
-    ),
-    (partial(LearnedUpsampler, scale=1.5, channels=4), "expects a whole number, but got 1.5"),
+    *((partial(TrilinearUpsampler, scale=s), "scale: expected a number > 1, but got") for s in (1, math.nan)),
+    (partial(LearnedUpsampler, scale=1.5, channels=4), "whole number for the learned layer, but got 1.5"),
     (refusing(ODD), "model.upsampler.scale: expected a whole number beside an inpainter, but got 1.5"),
     (refusing(start="hull"), "stage.coarse.start: expected box, since the images of 'ball' have no alpha"),
 ]
@@ -327,6 +307,6 @@ def test_the_weights_of_all_samples_are_kept_only_for_a_printed_form(literal, ne
         return march(self, name, rays, background, **options)
 
     monkeypatch.setattr(VoxelSnapshot, "march", noted)
-    method = forward_model()(Start(SCENE, "fine", {"num_voxels": [[0, 64]]}, [0], literal=literal))
-    method.look(ball_data(rays=4, frames=2, size=8).batches.draw(), {}, torch.Generator())
+    method = tiny.forward_model()(Start(SCENE, "fine", {"num_voxels": [[0, 64]]}, [0], literal=literal))
+    method.look(tiny.ball_data(rays=4, frames=2, size=8).batches.draw(), {}, torch.Generator())
     assert asked == [needed]

@@ -21,7 +21,7 @@ def test_schedules_hold_until_the_next_entry():
 SHAPE = (6, 5, 7)
 LATTICE = Lattice(Box((0, 0, 0), (5, 4, 6)), SHAPE)
 COMMON = {"features": 3, "alpha_init": 1e-2, "density_scale": 1.0, "alpha_threshold": 0.0}
-ALPHAS = {"keep_alpha": 1e-2, "birth_alpha": 5e-3}
+STAGE = VoxelStage(num_voxels=[[0, 100]], keep_alpha=1e-2, birth_alpha=5e-3)
 SOLID, AIR = 8.0, -9.0
 
 
@@ -56,7 +56,7 @@ def around(at):
 def test_refresh_keeps_values_and_moments_in_the_right_rows():
     made = radiance((2, 2, 3))
     optimizer = adam(made)
-    assert refresh(made, optimizer, **ALPHAS)
+    refresh(made, STAGE, optimizer, False, None)
     assert torch.equal(made.index >= 0, around((2, 2, 3)))
     x, y, z = made.voxels.unbind(-1)
     number = (x * SHAPE[1] + y) * SHAPE[2] + z
@@ -72,11 +72,12 @@ def test_refresh_keeps_values_and_moments_in_the_right_rows():
 def test_refresh_gives_births_to_new_voxels_and_no_moments():
     made = radiance((2, 2, 3))
     optimizer = adam(made)
-    refresh(made, optimizer, **ALPHAS)
-    assert not refresh(made, optimizer, **ALPHAS)  # nothing has changed
-    old = made.index >= 0
+    refresh(made, STAGE, optimizer, False, None)
+    old, density = made.index >= 0, made.density
+    refresh(made, STAGE, optimizer, False, None)
+    assert made.density is density  # nothing has changed
     made.density.data[made.index[3, 3, 4].long()] = SOLID  # matter has reached a corner of the active set
-    assert refresh(made, optimizer, **ALPHAS)
+    refresh(made, STAGE, optimizer, False, None)
     assert torch.equal(made.index >= 0, around((2, 2, 3)) | around((3, 3, 4)))
     new = ~old[made.voxels.unbind(-1)]
     alpha = made.activation.alpha(made.density[new, 0], LATTICE.voxel_size)
@@ -89,7 +90,7 @@ def test_refresh_gives_births_to_new_voxels_and_no_moments():
 def test_an_empty_grid_is_left_as_it_is():
     made = radiance()
     before = made.density
-    assert not refresh(made, adam(made), **ALPHAS)
+    refresh(made, STAGE, adam(made), False, None)
     assert made.density is before
 
 
@@ -98,14 +99,14 @@ def test_what_no_view_has_seen_is_forgotten_where_asked():
     assert seen_rows(made, torch.optim.Adam(made.parameters())).all()  # nothing is known yet
     optimizer = adam(made, unseen=[0])
     assert seen_rows(made, optimizer).logical_not().nonzero().tolist() == [[0]]
-    refresh(made, optimizer, **ALPHAS, only_seen=True)
+    refresh(made, STAGE, optimizer, True, None)
     assert torch.equal(made.index >= 0, around((5, 4, 6)))
 
 
 def test_voxels_are_born_only_where_allowed():
     made, allowed = radiance((2, 2, 3)), torch.zeros(SHAPE, dtype=torch.bool)
     allowed[3:] = True
-    refresh(made, adam(made), **ALPHAS, allowed=allowed)
+    refresh(made, STAGE, adam(made), False, allowed)
     expected = around((2, 2, 3)) & allowed
     expected[2, 2, 3] = True  # matter itself stays
     assert torch.equal(made.index >= 0, expected)
@@ -116,8 +117,7 @@ def test_resample_follows_what_is_occupied():
     optimizer = adam(made, unseen=[0])
     before = made().density(torch.tensor([[2.0, 2.0, 3.0]]))
     place = LATTICE.to_world(torch.tensor([[2, 2, 3]]))
-    options = {"keep_alpha": 1e-2, "optimizer": optimizer, "only_seen": True}
-    resample(made, Box((0, 0, 1), (5, 4, 6)), 1500, **options)
+    resample(made, STAGE, optimizer, Lattice.of_count(Box((0, 0, 1), (5, 4, 6)), 1500), only_seen=True)
     assert made.lattice.count == pytest.approx(1500, rel=0.2)
     torch.testing.assert_close(made().density(made.lattice.to_lattice(place)), before)
     reach = (made.lattice.to_world(made.voxels) - place).abs().amax(-1).max()
@@ -132,14 +132,14 @@ def test_resample_does_not_lose_the_border_to_rounding():
     made = DirectRadiance(Lattice(box, SHAPE), torch.ones(SHAPE, dtype=torch.bool), **COMMON)
     made.density.data[:] = AIR
     made.density.data[made.index[-1].flatten().long()] = SOLID
-    resample(made, box, 800, keep_alpha=1e-2)
+    resample(made, STAGE, None, Lattice.of_count(box, 800))
     assert (made.index[-2:] >= 0).all()
     assert (made.index[:-2] < 0).all()
 
 
 def test_resample_of_an_empty_field_keeps_all_voxels():
     made = radiance()
-    resample(made, LATTICE.box, 400, keep_alpha=1e-2)
+    resample(made, STAGE, None, Lattice.of_count(LATTICE.box, 400))
     assert (made.index >= 0).all()
 
 

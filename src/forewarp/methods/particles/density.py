@@ -122,8 +122,7 @@ def most_opaque(particles: Particles) -> Tensor:
     base = particles.opacity.data[:, 0]
     if particles.opacity_over_time is None:
         return base
-    times = [i / _TIMES for i in range(_TIMES + 1)]
-    bases = base.new_tensor([particles.opacity_basis(time) for time in times])  # (T, F)
+    bases = torch.stack([particles.time_bases(i / _TIMES)[1][1:] for i in range(_TIMES + 1)])  # (T, F)
     return base + (bases @ particles.opacity_over_time.data.T).amax(0)
 
 

@@ -13,28 +13,15 @@ from torch import Tensor, nn
 from forewarp.fields.curves import Curve
 from forewarp.fields.moving import GaussiansSnapshot, cosines, pinhole_of
 from forewarp.losses import IMAGE_LOSSES, robust
-from forewarp.methods.method import Method, Snapshot, Start, Step, value_at
-from forewarp.methods.particles import density, exposure, queries
+from forewarp.methods.method import Snapshot, Start, Step, value_at
+from forewarp.methods.particles import density, exposure
 from forewarp.methods.particles.nodes import Nodes, Skinning, TimeOffsets, are_rows
 from forewarp.methods.particles.options import EFFECTS, SMALLEST, Effects, Numbers, view_share
+from forewarp.methods.particles.queries import Queries
 from forewarp.methods.particles.shared import begin_window, check_still, left_alone
-from forewarp.methods.particles.start import (
-    at_rest,
-    compile_kernels,
-    covered_pixels,
-    first_points,
-    first_values,
-    widths,
-)
+from forewarp.methods.particles.start import at_rest, compile_kernels, first_values, fresh_values
 from forewarp.methods.rows import RowsAdam
-from forewarp.ops.gaussians import (
-    BLUR,
-    CHUNK,
-    DEEP,
-    Gaussians,
-    Warp,
-    compare,
-)
+from forewarp.ops.gaussians import BLUR, CHUNK, DEEP, Gaussians, Warp, compare
 from forewarp.ops.nodes import pull_nodes
 from forewarp.scene.cloud import Cloud
 from forewarp.scene.view import Asks, Batch, Moment, Observation
@@ -58,7 +45,7 @@ class ParticlesSnapshot(GaussiansSnapshot, Snapshot):
         return moment.time == self.moment.time and lit[0] == lit[1]
 
 
-class Particles(Method):
+class Particles(Queries):
     """N canonical Gaussians, and M nodes that carry them through time.
 
     A step renders a whole image, compares it, and has its gradients in one pass of ``ops.compare``; the
@@ -76,14 +63,9 @@ class Particles(Method):
     terms = ("photo", *IMAGE_LOSSES, "depth", "rigid", "smooth", "static")
     numbers = tuple(key for key in Numbers.__dataclass_fields__ if key != "name")
     asks = Asks(kind="pictures", straight=True)
+    loose = Skinning.ROWS  # a particle follows fewer nodes where there are few
     effects, still_steps = EFFECTS, 700  # a step is of one image
     on_cpu = "its kernels are the CPU's"
-
-    # Scene queries: see ``methods.method``.
-    matter, bounds, trajectories = queries.matter, queries.bounds, queries.trajectories
-    ellipsoids, template, movement = queries.ellipsoids, queries.template, queries.movement
-    moving, in_motion, only, common = queries.moving, queries.in_motion, queries.only, queries.common
-    carried = queries.carried
 
     def __init__(
         self,
@@ -101,11 +83,10 @@ class Particles(Method):
         self.deep, self.chunk = deep, chunk
         if start.weights.get("depth"):
             self.asks = replace(self.asks, sensed=True)
+        train, times = start.scene.train, start.scene.instants
         # Whether a step's images come with planes beside their colours, which the kernels are compiled for.
-        self.has_planes = any(
-            frame.load_valid or (self.asks.sensed and frame.load_sensed) for frame in start.scene.train
-        )
-        self.views, times = len(start.scene.train), start.scene.instants
+        self.has_planes = any(f.load_valid or (self.asks.sensed and f.load_sensed) for f in train)
+        self.views = len(train)
         effects = Effects(**choices).only(self.stage.effects, len(times))
         self.ends = min(times), max(times)
         self.progress = self.decay = self.hidden_decay = 0.0
@@ -127,7 +108,7 @@ class Particles(Method):
         self.opacity_over_time = _coefficients(values.get("opacity_over_time"), count, opacities)
         lights = exposure.count_of(effects.exposure or 0, start.scene)
         self.exposure = _coefficients(values.get("exposure"), lights, 2, 3) if lights else None
-        self.lit_cameras = frozenset(frame.camera_id for frame in start.scene.train if lights)
+        self.lit_cameras = frozenset(frame.camera_id for frame in train if lights)
         # Of the rounds of density control; the first two are sums since the last round.
         self.register_buffer("gradient_sum", torch.zeros(count))
         self.register_buffer("image_count", torch.zeros(count))  # that showed a particle
@@ -189,16 +170,8 @@ class Particles(Method):
             values = first_values(Cloud(torch.zeros(1, 3), torch.zeros(1, 3), torch.zeros(1), 1.0))
             values |= {"shared": torch.tensor([-1])} if start.shares else {}
         else:
-            covered = covered_pixels(start.scene, list(start.frames))
-            count = round(self.stage.initial_share * self.stage.final_count(covered, self.views))
-            cloud = first_points(start, count, 0.0 if self.box is None else self.stage.shell)
-            beyond = self.beyond(cloud.points)
-            near = cloud.points if bool(beyond.all()) else cloud.points[~beyond]
-            distances = (near - near.median(0).values).norm(dim=-1)
-            extent = float(distances.median()) or start.scene.box.diagonal
-            # Points of a hull lie on its surface, and are as far apart as particles should be large.
-            widest = None if start.scene.has_alpha else widths(start.scene, cloud.points, covered)
-            values = first_values(cloud, widest, beyond)
+            shell = 0.0 if self.box is None else self.stage.shell
+            values, covered, extent = fresh_values(start, self.stage, shell, self.beyond)
         self.register_buffer("covered_pixels", torch.tensor(covered))
         self.register_buffer("extent", torch.tensor(extent))
         self.register_buffer("moving_pixels", torch.tensor(moving) if start.shares else None)
@@ -223,26 +196,14 @@ class Particles(Method):
         """See ``Method``."""
         return "particles", len(self.means)
 
-    def adopted(self) -> set[str]:
-        """See ``Method``: nodes too are as many as a checkpoint says."""
-        nodes = () if self.nodes is None else self.nodes.rows()
-        return {*self.grows, *(f"nodes.{name}" for name in nodes)}
-
     def misfit(self, state: Mapping[str, Tensor]) -> str | None:
-        """See ``Method``; what is stored of nodes must go together, too."""
-        if self.nodes is None:
-            return super().misfit(state)
-        if len({state[name].shape for name in Skinning.ROWS}) > 1:
-            return Skinning.ROWS[0]
-        if misfit := self.nodes.misfit(state, "nodes."):
+        """See ``Method``; what is stored of the skinning must go together with all nodes, too."""
+        misfit = super().misfit(state)
+        if misfit or self.nodes is None:
             return misfit
-        if not are_rows(state["skinning.links"], len(state["nodes.positions"])):
-            return "skinning.links"
-        width = self.skinning.links.shape[1]  # a particle follows fewer nodes where there are few
-        links = {
-            name: state[name][:, :1].expand(-1, width) for name in Skinning.ROWS if state[name].dim() == 2
-        }
-        return super().misfit({**state, **links})
+        links, *others = (state[name] for name in self.loose)
+        fits = len(links) == len(state["means"]) and all(links.shape == other.shape for other in others)
+        return None if fits and are_rows(links, len(state["nodes.positions"])) else self.loose[0]
 
     def at(self, moment: Moment) -> Snapshot:
         """Move every particle; nothing is rendered yet."""
@@ -254,12 +215,10 @@ class Particles(Method):
         """Return the particles, in a ``light`` or their own, as the operators read them: coefficients of one
         kind in one tensor.
         """
-        opacity = [self.opacity] if self.opacity_over_time is None else [self.opacity, self.opacity_over_time]
-        opacity = opacity[0] if len(opacity) == 1 else torch.cat(opacity, -1)
-        colors = [getattr(self, name) for name in self._color_parameters()]
-        colors = colors[0] if len(colors) == 1 else torch.cat(colors, 1)
+        opacities = [part for part in (self.opacity, self.opacity_over_time) if part is not None]
+        colors = self._joined([getattr(self, name) for name in self._color_parameters()])
         colors = colors if light is None else exposure.lit(colors, light)
-        return Gaussians(self.means, self.scales, self.quaternions, opacity, colors)
+        return Gaussians(self.means, self.scales, self.quaternions, self._joined(opacities), colors)
 
     def light(self, moment: Moment) -> Tensor | None:
         """Return the gain and the bias (2, 3) of the colours of an image that a camera of the training images
@@ -271,6 +230,10 @@ class Particles(Method):
 
     def _drift(self, time: float) -> list[float]:
         return exposure.basis_at(len(self.exposure), time, self.shared is not None)
+
+    @staticmethod
+    def _joined(kinds: list[Tensor]) -> Tensor:
+        return kinds[0] if len(kinds) == 1 else torch.cat(kinds, 1)
 
     def _color_parameters(self) -> list[str]:
         """Return the parameters of colour that there are, in the operators' order."""
@@ -285,21 +248,9 @@ class Particles(Method):
 
     def time_bases(self, time: float) -> tuple[Tensor, Tensor]:
         """Return what a time makes of the coefficients of colour (T,) and of opacity (1 + F,)."""
-        color = [] if self.color_over_time is None else self.color_basis(time)
-        opacity = [] if self.opacity_over_time is None else self.opacity_basis(time)
+        counts = (0 if p is None else p.shape[1] for p in (self.color_over_time, self.opacity_over_time))
+        color, opacity = (cosines(count, time, self.canonical_time) for count in counts)
         return self.means.new_tensor(color), self.means.new_tensor([1.0, *opacity])
-
-    def color_basis(self, time: float) -> list[float]:
-        """Return the cosines of colour over time."""
-        return self._cosines(self.color_over_time.shape[1], time)
-
-    def opacity_basis(self, time: float) -> list[float]:
-        """Return the cosines of opacity over time."""
-        return self._cosines(self.opacity_over_time.shape[1], time)
-
-    def _cosines(self, count: int, time: float) -> list[float]:
-        """Return ``cos(pi k t) - cos(pi k t_c)`` for k = 1 .. count: 0 at the canonical time."""
-        return cosines(count, time, self.canonical_time)
 
     @torch.no_grad()
     def look(self, batch: Batch, factors: Mapping[str, float], generator: torch.Generator) -> Step:
@@ -393,9 +344,8 @@ class Particles(Method):
             gradients["opacity_over_time"] = opacity[:, 1:]
         if nodes is not None:
             rigid = factors.get("rigid", 0.0) * self.stage.rigid_final_factor**self.progress
-            by_motion, terms["rigid"] = pull_nodes(
-                motion, nodes.positions, compared.maps, nodes.edges, nodes.edge_weights, rigid
-            )
+            edges = nodes.edges, nodes.edge_weights
+            by_motion, terms["rigid"] = pull_nodes(motion, nodes.positions, compared.maps, *edges, rigid)
             smooth, extent = factors.get("smooth", 0.0), float(self.extent)
             if "static" in factors:
                 to_rest, terms["static"] = nodes.pull_to_rest(motion, factors["static"], extent)
@@ -482,9 +432,8 @@ class Particles(Method):
 
     def departures(self) -> list[str]:
         """See ``Method``."""
-        return [
-            "from the forward-flow paper: particles that are rasterised, not voxels that rays march through"
-        ]
+        note = "particles that are rasterised, not voxels that rays march through"
+        return [f"from the forward-flow paper: {note}"]
 
 
 def _coefficients(before: Tensor | None, *shape: int) -> nn.Parameter | None:

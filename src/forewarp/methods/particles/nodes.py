@@ -83,7 +83,7 @@ class Nodes(nn.Module):
         edges: neighbours that a node is kept rigid with.
     """
 
-    ROWS = ("positions", "edges", "edge_weights", "spacing", "stopped", "translations", "rotations")
+    loose = ("edges", "edge_weights")  # few nodes have few neighbours
 
     def __init__(
         self,
@@ -115,6 +115,8 @@ class Nodes(nn.Module):
         self._averaged: tuple[list[float], Tensor] | None = None  # see _mean_basis
         self.register_buffer("stopped", torch.zeros(count, dtype=torch.bool) if rests else None)
         self.register_buffer("seen_times", torch.tensor([curve.canonical_time] * 2))  # from, to
+        names = ("positions", "edges", "edge_weights", "spacing", "stopped", "translations", "rotations")
+        self.grows = tuple(name for name in names if getattr(self, name) is not None)
 
     def links(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """Return the nodes that points (N, 3) follow: rows (N, L) int32, and their shares (N, L).
@@ -147,12 +149,9 @@ class Nodes(nn.Module):
 
     def param_groups(self) -> dict[str, list[nn.Parameter]]:
         """Return what is learned, by the name of its learning rate."""
-        groups = {"node_translations": [self.translations]}
-        if self.rotations is not None:
-            groups["node_rotations"] = [self.rotations]
-        if self.time_offsets is not None:
-            groups["time_offsets"] = [self.time_offsets.values]
-        return groups
+        groups = {"node_translations": [self.translations], "node_rotations": self._coefficients()[1:]}
+        groups["time_offsets"] = [] if self.time_offsets is None else [self.time_offsets.values]
+        return {name: group for name, group in groups.items() if group}
 
     def _coefficients(self) -> list[nn.Parameter]:
         return [self.translations] if self.rotations is None else [self.translations, self.rotations]
@@ -209,31 +208,13 @@ class Nodes(nn.Module):
             stays = torch.einsum("mkc,k->mc", value[which], mean)
             value[which] = stays[:, None] if self.curve.kind == "spline" else 0.0
 
-    def rows(self) -> list[str]:
-        """Return the names of what has a row for each node."""
-        return [name for name in self.ROWS if getattr(self, name) is not None]
-
     def misfit(self, state: Mapping[str, Tensor], prefix: str) -> str | None:
-        """Name an entry of a stored state that contradicts the others; None where all is well.
-
-        All have as many rows as there are positions, and no edge points at a node that there is not.
+        """Name the edges of a stored state if there is not one row of them for each node, or one points at a
+        node that there is not; None where all is well.
         """
-        count, edges = len(state[prefix + "positions"]), state[prefix + "edges"]
-        for name in self.rows():
-            here, stored = getattr(self, name), state[prefix + name]
-            free = 2 if name in ("edges", "edge_weights") else 1  # few nodes have few neighbours
-            fits = stored.dtype == here.dtype and stored.dim() == here.dim() and len(stored) == count
-            if not fits or stored.shape[free:] != here.shape[free:]:
-                return prefix + name
-        same = edges.shape == state[prefix + "edge_weights"].shape
-        return None if same and are_rows(edges, count) else prefix + "edges"
-
-    def _load_from_state_dict(self, state, prefix, *args, **kwargs) -> None:
-        for name in self.rows():  # a checkpoint says how many nodes there are
-            if prefix + name in state:
-                here = getattr(self, name)
-                here.data = here.data.new_empty(state[prefix + name].shape)
-        super()._load_from_state_dict(state, prefix, *args, **kwargs)
+        nodes, edges, weights = (state[prefix + name] for name in ("positions", *self.loose))
+        fits = len(edges) == len(nodes) and edges.shape == weights.shape and are_rows(edges, len(nodes))
+        return None if fits else f"{prefix}edges"
 
     def backward(
         self, time: float, motion_time: float, basis: Tensor, by_motion: Tensor, factor: float, unit: float
@@ -254,9 +235,8 @@ class Nodes(nn.Module):
             the mean of the squared second differences, and gradients by the parameters' names.
         """
         bend = self._second_difference(motion_time) if factor else torch.zeros_like(basis)
-        *gradients, bent = spread_nodes(
-            self.translations, self.rotations, by_motion, basis, bend, factor, unit
-        )
+        coefficients = self.translations, self.rotations
+        *gradients, bent = spread_nodes(*coefficients, by_motion, basis, bend, factor, unit)
         if self.stopped is not None and bool(self.stopped.any()):
             for gradient in gradients:
                 if gradient is not None:

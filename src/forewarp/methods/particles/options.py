@@ -8,10 +8,11 @@ from dataclasses import dataclass, fields, replace
 
 from forewarp.fields.curves import KINDS
 from forewarp.methods.effect import Effect, Evidence
-from forewarp.methods.method import steps_of
-from forewarp.ops.backend import is_number
+from forewarp.methods.method import check_effects, check_number, steps_of
+from forewarp.ops.backend import check_value, is_number
 
 SMALLEST = 96  # pixels of an image's longer side, below which none is made smaller
+OF_COSINES = ("color_over_time", "opacity_over_time", "exposure")  # effects that are a number of these
 _VIEWS = 100  # training images from which on more of them call for no more particles
 
 
@@ -47,17 +48,12 @@ class Effects:
             ("motion", " or ".join(KINDS), lambda choice: choice in KINDS),
             ("rotation", "true", lambda choice: choice is True),
             ("view_dependence", "a degree of 1 to 3", lambda choice: _is_count(choice) and choice <= 3),
-            ("color_over_time", "a number of cosines >= 1", _is_count),
-            ("opacity_over_time", "a number of cosines >= 1", _is_count),
-            ("exposure", "a number of cosines >= 1", _is_count),
+            *((name, "a number of cosines >= 1", _is_count) for name in OF_COSINES),
             ("background", "a number > 0", lambda choice: is_number(choice) and choice > 0),
         ):
-            choice = getattr(self, name)
-            if choice is not None and not valid(choice):
-                raise ValueError(
-                    f"model.{name}: expected {expected}, or null, but got {choice!r}; "
-                    f"choose model/{name}=none to switch it off"
-                )
+            if (choice := getattr(self, name)) is not None:
+                off = f"choose model/{name}=none to switch it off"
+                check_value(f"model.{name}", choice, f"{expected}, or null", valid, off)
 
     def only(self, names: Sequence[str], times: int) -> Effects:
         """Switch off all effects but those named, and, in a scene of one time, those that need several."""
@@ -143,35 +139,23 @@ class Numbers:
 
     def __post_init__(self) -> None:
         where = f"stage.{self.name}"
-        if not set(self.effects) <= set(NAMES):
-            raise ValueError(
-                f"{where}.effects: expected some of {', '.join(NAMES)}, but got {list(self.effects)}"
-            )
+        check_effects(f"{where}.effects", self.effects, NAMES)
         steps_of(f"{where}.image_scale", self.image_scale, from_start=True)
         for key in ("natural_splines", "rest_by_masks"):
-            if not isinstance(getattr(self, key), bool):
-                raise ValueError(f"{where}.{key}: expected true or false, but got {getattr(self, key)!r}")
+            check_value(f"{where}.{key}", getattr(self, key), "true or false", lambda v: isinstance(v, bool))
         shares = "initial_share", "final_share", "density_interval", "rigid_final_factor"
-        for keys, expected, valid in (
+        decays = "opacity_decay", "crowd_decay", "hidden_decay"
+        others = "density_until", "rest_from", "jitter", "time_offsets"
+        for keys, *wanted in (
             (shares, "a number in (0, 1]", lambda value: 0 < value <= 1),
+            (decays, "a number in [0, 1)", lambda value: 0 <= value < 1),
             (("density", "nodes", "knots", "jitter_until"), "a number > 0", lambda value: value > 0),
             (("edges", "relink"), "a whole number >= 1", lambda value: value >= 1 and value == int(value)),
-            (
-                ("opacity_decay", "crowd_decay", "hidden_decay"),
-                "a number in [0, 1)",
-                lambda value: 0 <= value < 1,
-            ),
-            (
-                ("density_until", "rest_from", "jitter", "time_offsets"),
-                "a number >= 0",
-                lambda value: value >= 0,
-            ),
+            (others, "a number >= 0", lambda value: value >= 0),
             (("shell",), "0 or a number >= 1", lambda value: value == 0 or value >= 1),
         ):
             for key in keys:
-                value = getattr(self, key)
-                if not (is_number(value) and valid(value)):
-                    raise ValueError(f"{where}.{key}: expected {expected}, but got {value!r}")
+                check_number(f"{where}.{key}", getattr(self, key), *wanted)
 
     def final_count(self, covered_pixels: float, views: int) -> int:
         """Return how many particles there are in the end.

@@ -22,10 +22,8 @@ if TYPE_CHECKING:
 _MOMENTS, _CAMERAS = 6, 12  # at which, and by how many cameras of each, it is looked at what moves
 _WRONG = 0.05, 0.15  # error from which on a pixel is wrong: thrice its image's mean, but at least and at most
 _GROWN = 0.01  # share of an image's width by which what is wrong is enlarged
-_MOVES, _NEW = (
-    0.5,
-    0.75,
-)  # share of a moment's views that show a place wrongly: it moves; a new point is on it
+# Share of a moment's views that show a place wrongly: it moves; a new point is on it.
+_MOVES, _NEW = 0.5, 0.75
 _POINTS = 4096  # tried on what moves
 _FEW = 16  # particles that are too few to move
 
@@ -40,9 +38,9 @@ def check_still(before: Method) -> None:
     over_time = ("nodes", "color_over_time", "opacity_over_time")
     stands = hasattr(before, "shared") and all(getattr(before, name) is None for name in over_time)
     if not stands and getattr(before, "shared", None) is None:
+        made = "make it by the same command with windows=still, without data.window and start"
         raise ValueError(
-            "start: expected a run of model=particles that stand still, but got one of another kind; make it "
-            "by the same command with windows=still, without data.window and start"
+            f"start: expected a run of model=particles that stand still, but got one of another kind; {made}"
         )
 
 

@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from forewarp.methods.method import Start
+from forewarp.methods.particles.options import Numbers
 from forewarp.ops.adam import AdamState, adam_rows
 from forewarp.ops.backend import cores, use_numba
 from forewarp.ops.gaussians import (
@@ -75,10 +76,7 @@ def first_points(start: Start, count: int, shell: float = 0.0) -> Cloud:
         cloud = left[visible] if int(visible.sum()) >= _FEW else left
     elif scene.has_alpha:
         cloud = hull_surface(scene, list(start.frames), count)
-    if cloud is None:
-        cloud = measured(scene, count)
-    if cloud is None:
-        cloud = swept(scene, list(start.frames), count, shell)
+    cloud = cloud or measured(scene, count) or swept(scene, list(start.frames), count, shell)
     if cloud is None or len(cloud) < _FEW:
         cloud = anywhere(scene.box, count)
     return cloud if len(cloud) <= count else cloud[torch.randperm(len(cloud))[:count].sort().values]
@@ -97,13 +95,10 @@ def hull_surface(scene: Scene, frames: list[int], count: int) -> Cloud | None:
 
     Silhouettes are grown by how far later frames may have moved. Colours are means over the frames.
     """
-    frames = frames[:_FRAMES]
-    images = [scene.train[i].load() for i in frames]
-    cameras = [scene.train[i].camera for i in frames]
-    masks = []
-    for i, rgba in zip(frames, images):
-        delay = abs(scene.train[i].time - scene.canonical_time)
-        masks.append(dilate(rgba[..., 3] > 127, max(1, round(_DRIFT * delay * rgba.shape[1]))))
+    first = [scene.train[i] for i in frames[:_FRAMES]]
+    images, cameras = [frame.load() for frame in first], [frame.camera for frame in first]
+    drifts = [_DRIFT * abs(f.time - scene.canonical_time) * f.camera.width for f in first]
+    masks = [dilate(rgba[..., 3] > 127, max(1, round(drift))) for rgba, drift in zip(images, drifts)]
     side = max(max(camera.width, camera.height) for camera in cameras)  # small images tell no finer shape
     rough = Lattice.of_count(scene.box, min(_ROUGH, side) ** 3)
     points = rough.to_world(rough.all_voxels())
@@ -116,25 +111,19 @@ def hull_surface(scene: Scene, frames: list[int], count: int) -> Cloud | None:
     fine = Lattice.of_count(box, min(_FINE, 2 * side) ** 3)
     voxels = fine.all_voxels()
     # Only what the rough hull, a voxel wider, allows is looked at again.
-    allowed = _grown(inside.reshape(rough.shape))
+    allowed = dilate(inside.reshape(rough.shape))
     at = rough.to_lattice(fine.to_world(voxels)).round().long()
     at = torch.minimum(at.clamp(min=0), torch.tensor(rough.shape) - 1)
     maybe = allowed[at.unbind(-1)]
-    solid = torch.zeros(len(voxels), dtype=torch.bool)
-    solid[maybe] = visual_hull(fine.to_world(voxels[maybe]), cameras, masks)
-    solid = solid.reshape(fine.shape)
-    shell = (solid & _grown(~solid)).nonzero()
+    solid = torch.zeros(fine.shape, dtype=torch.bool)
+    solid.view(-1)[maybe] = visual_hull(fine.to_world(voxels[maybe]), cameras, masks)
+    shell = (solid & dilate(~solid)).nonzero()
     if not len(shell):
         return None
     area = len(shell) * fine.voxel_size**2
     points = fine.to_world(shell[torch.randint(len(shell), (count,))] + torch.rand(count, 3) - 0.5)
     colors = seen_colors(points, cameras, images)
     return Cloud(points, colors, torch.full((count,), 0.5), (area / count) ** 0.5)
-
-
-def _grown(mask: Tensor) -> Tensor:
-    """Make a mask (X, Y, Z) one voxel wider on all sides; beyond its faces is nothing."""
-    return torch.nn.functional.max_pool3d(mask[None, None].float(), 3, 1, 1)[0, 0] > 0
 
 
 def at_rest(scene: Scene, points: Tensor) -> Tensor:
@@ -194,15 +183,37 @@ def first_values(
         size = torch.where(beyond, apart, size)
     if widest is not None:
         size = torch.minimum(size, widest.clamp(min=1e-3 * median))
-    quaternions = torch.zeros(len(points), 4)
-    quaternions[:, 0] = 1
-    return {
-        "means": points.clone(),
-        "scales": size.log()[:, None].repeat(1, 3),
-        "quaternions": quaternions,
-        "opacity": torch.zeros(len(points), 1),
-        "colors": ((cloud.colors.float() - 0.5) / FLAT)[:, None].clone(),
-    }
+    shape = {"scales": size.log()[:, None].repeat(1, 3)}
+    shape["quaternions"] = torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(len(points), 1)
+    colors = ((cloud.colors.float() - 0.5) / FLAT)[:, None].clone()
+    return {"means": points.clone(), **shape, "opacity": torch.zeros(len(points), 1), "colors": colors}
+
+
+def fresh_values(
+    start: Start, stage: Numbers, shell: float, beyond: Callable[[Tensor], Tensor]
+) -> tuple[dict[str, Tensor], float, float]:
+    """Make the first particles of a fit.
+
+    Args:
+        start, stage: of the method.
+        shell: see ``swept``.
+        beyond: tells which points (N, 3) lie outside the box in which motion is looked for, (N,) bool.
+
+    Returns:
+        their values; how many pixels of an image show anything; and the median distance of what lies within
+        the box from its middle.
+    """
+    scene = start.scene
+    covered = covered_pixels(scene, list(start.frames))
+    count = round(stage.initial_share * stage.final_count(covered, len(scene.train)))
+    cloud = first_points(start, count, shell)
+    outside = beyond(cloud.points)
+    near = cloud.points if bool(outside.all()) else cloud.points[~outside]
+    distances = (near - near.median(0).values).norm(dim=-1)
+    extent = float(distances.median()) or scene.box.diagonal
+    # Points of a hull lie on its surface, and are as far apart as particles should be large.
+    widest = None if scene.has_alpha else widths(scene, cloud.points, covered)
+    return first_values(cloud, widest, outside), covered, extent
 
 
 def measured(scene: Scene, count: int) -> Cloud | None:
@@ -218,25 +229,26 @@ def measured(scene: Scene, count: int) -> Cloud | None:
     for i in (order[k] for k in spread(len(order), _MEASURED)):
         frame, camera = scene.train[i], scene.train[i].camera
         step = max(1, round((camera.width * camera.height / (_FIRST * count)) ** 0.5))
-        rows, columns = torch.meshgrid(
-            torch.arange(step // 2, camera.height, step),
-            torch.arange(step // 2, camera.width, step),
-            indexing="ij",
-        )
-        distance, trust = frame.load_sensed()[:, rows, columns].flatten(1)
+        rows, columns = _every(step, camera, step // 2, step // 2)
+        distance, trust = frame.load_sensed()[:, rows, columns]
         known = (distance > 0) & (trust >= _TRUSTED)
         if frame.load_valid is not None:
-            known &= frame.load_valid()[rows, columns].flatten()
-        rays = camera.rays((rows * camera.width + columns).flatten()[known])
-        new, distance = rays.origins + distance[known, None] * rays.directions, distance[known]
+            known &= frame.load_valid()[rows, columns]
+        rows, columns, distance = rows[known], columns[known], distance[known]
+        rays = camera.rays(rows * camera.width + columns)
+        new = rays.origins + distance[:, None] * rays.directions
         added = distance > (1 + _BEHIND) * _farthest(points, new, camera, step)
         points = torch.cat([points, new[added]])
-        colors = torch.cat(
-            [colors, frame.load()[rows, columns, :3].flatten(0, 1)[known][added].float() / 255]
-        )
+        colors = torch.cat([colors, frame.load()[rows[added], columns[added], :3].float() / 255])
         if math.isnan(size) and len(distance):
             size = float(distance.median()) * step / camera.fx
     return Cloud(points, colors, torch.full((len(points),), 0.5), size) if len(points) else None
+
+
+def _every(step: int, camera: Camera, top: int, left: int) -> tuple[Tensor, Tensor]:
+    """Return row and column (P,) of the pixels that are ``step`` apart, from the first one on."""
+    rows, columns = torch.arange(top, camera.height, step), torch.arange(left, camera.width, step)
+    return torch.cartesian_prod(rows, columns).unbind(-1)
 
 
 def _farthest(points: Tensor, new: Tensor, camera: Camera, step: int) -> Tensor:
@@ -293,8 +305,8 @@ def swept(scene: Scene, frames: list[int], count: int, shell: float = 0.0) -> Cl
             sizes += [size] if beyond == 1 else []
     if shell > 0:
         for i in spread(len(scene.train), _SHELLED):
-            new, color = _behind(small(i), max(4, side // _COARSER), torch.cat(points), shell)
-            points.append(new)
+            rays, color, _ = _holes(small(i), max(4, side // _COARSER), torch.cat(points))
+            points.append(rays.origins + shell * small(i)[2].far * rays.directions)
             colors.append(color)
     points, colors = torch.cat(points), torch.cat(colors)
     if not len(points):
@@ -368,26 +380,14 @@ def _neighbours(scene: Scene, i: int) -> list[int]:
     return sorted(others, key=lambda j: (abs(times[j] - times[i]), away[j], abs(j - i)))[:_NEIGHBOURS]
 
 
-def _behind(image: tuple[Tensor, Tensor, Camera], side: int, before: Tensor, shell: float):
-    """Return points (P, 3) ``shell`` far planes away where an image's lattice shows none of those ``before``
-    (N, 3), and their colours (P, 3).
-    """
-    rays, color, _ = _holes(image, side, before)
-    return rays.origins + shell * image[2].far * rays.directions, color
-
-
 def _holes(image: tuple[Tensor, Tensor, Camera], side: int, before: Tensor) -> tuple[Rays, Tensor, int]:
     """Return the rays of an image's lattice whose cells hold none of the points ``before`` (N, 3), their
     colours (P, 3), and how many pixels they are apart. There is none at a pixel that is not valid.
     """
     rgb, valid, camera = image
     step = max(1, round(max(camera.width, camera.height) / side))
-    rows, columns = torch.meshgrid(
-        torch.arange(min(step // 2, camera.height - 1), camera.height, step),
-        torch.arange(min(step // 2, camera.width - 1), camera.width, step),
-        indexing="ij",
-    )
-    rows, columns = rows.flatten(), columns.flatten()
+    first = (min(step // 2, side - 1) for side in (camera.height, camera.width))
+    rows, columns = _every(step, camera, *first)
     rays = camera.rays(rows * camera.width + columns)
     is_hole = _in_holes(before, rays.origins + rays.directions, camera, side)
     is_hole &= valid[rows, columns]  # what is not learned from is no start either

@@ -13,6 +13,7 @@ from forewarp.fields.networks import mlp
 from forewarp.methods.method import Start
 from forewarp.methods.voxel.model import Factory, VoxelMethod, VoxelSnapshot
 from forewarp.methods.voxel.structure import EFFECTS
+from forewarp.ops.backend import check_value
 from forewarp.ops.encode import encoded_size, positional_encoding
 from forewarp.ops.grid import dilate
 from forewarp.scene.box import Box, Lattice
@@ -116,10 +117,7 @@ class BackwardWarp(VoxelMethod):
     effects = tuple(effect for effect in EFFECTS if effect.name in ("view_dependence", "background"))
 
     def __init__(self, start: Start, *, deformation: Factory, **shared) -> None:
-        if not callable(deformation):
-            raise ValueError(
-                f"model.deformation: expected a factory, but got {deformation!r}; choose another model"
-            )
+        check_value("model.deformation", deformation, "a factory", callable, "choose another model")
         super().__init__(start, **shared)
         scene = start.scene
         self.moves = "motion" in self.stage.effects and len(scene.times) > 1

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -13,6 +14,8 @@ from torch.utils.checkpoint import checkpoint
 from forewarp.fields.curves import TrajectoryField
 from forewarp.fields.grids import EMPTY, DirectRadiance, FieldAtTime, RadianceGrid, Shade, VoxelGrid
 from forewarp.fields.networks import mlp
+from forewarp.methods.method import FRACTION, check_least, check_number
+from forewarp.ops.backend import check_value
 from forewarp.ops.encode import encoded_size, positional_encoding, spherical_harmonics_1
 from forewarp.ops.grid import index_of, occupied_cells, trilinear
 from forewarp.ops.splat import average_splat, with_copies
@@ -35,11 +38,9 @@ class Motion(nn.Module):
         self, trajectory: TrajectoryField, *, tau: float = 1e-2, fade: float = 0.5, rest: float = 0.05
     ) -> None:
         super().__init__()
-        if not (0 < tau <= 1 and 0 <= fade <= 1 and 0 <= rest < 0.5):
-            raise ValueError(
-                "model.motion: expected 0 < tau <= 1, 0 <= fade <= 1 and 0 <= rest < 0.5, "
-                f"but got {tau=}, {fade=}, {rest=}"
-            )
+        check_number("model.motion.tau", tau, "a number in (0, 1]", lambda share: 0 < share <= 1)
+        check_number("model.motion.fade", fade, *FRACTION)
+        check_number("model.motion.rest", rest, "a number in [0, 0.5)", lambda voxels: 0 <= voxels < 0.5)
         self.trajectory, self.tau, self.fade, self.rest = trajectory, tau, fade, rest
 
     def flow(self, grid: VoxelGrid, time: float) -> Tensor:
@@ -197,11 +198,8 @@ class UNet3d(nn.Module):
         head: bool = True,
     ) -> None:
         super().__init__()
-        if width % 16 or levels < 2:
-            raise ValueError(
-                "model.inpainter: expected a width that is a multiple of 16 and levels >= 2, "
-                f"but got {width=}, {levels=}"
-            )
+        check_value("model.inpainter.width", width, "a multiple of 16", lambda number: number % 16 == 0)
+        check_least(2, of="model.inpainter", levels=levels)
         self.channels, self.width, self.margin = channels, width, margin
         self.coverage_channel = coverage_channel
         widths = [width * 2**level for level in range(levels)]
@@ -247,10 +245,8 @@ class TrilinearUpsampler(nn.Module):
 
     def __init__(self, *, scale: float = 2.0) -> None:
         super().__init__()
-        if not scale > 1:
-            raise ValueError(
-                f"model.upsampler.scale: expected a number > 1, but got {scale}; or model/upsampler=none"
-            )
+        none = "or choose model/upsampler=none"
+        check_value("model.upsampler.scale", scale, "a number > 1", lambda times: times > 1, none)
         self.scale = scale
 
     def forward(self, grid: RadianceGrid) -> RadianceGrid:
@@ -297,10 +293,8 @@ class LearnedUpsampler(TrilinearUpsampler):
         recompute: bool = True,
     ) -> None:
         super().__init__(scale=scale)
-        if int(scale) != scale:
-            raise ValueError(
-                f"model.upsampler.scale: the learned layer expects a whole number, but got {scale}"
-            )
+        wanted = "a whole number for the learned layer"
+        check_value("model.upsampler.scale", scale, wanted, lambda times: times == int(times))
         self.scale, self.margin, self.recompute = int(scale), margin, recompute
         self.project = Pointwise(features or channels, width)
         self.layers = nn.Sequential(ConvBlock(width, width), ConvBlock(width, width))
@@ -309,17 +303,15 @@ class LearnedUpsampler(TrilinearUpsampler):
     def residual(self, features: Tensor, crop: Crop) -> Tensor:
         """Coarse features (1, F, x, y, z) of ``crop`` -> detail (1, 1 + C, x', y', z') of the fine crop."""
         first, second = self.layers
-        parts = (
-            lambda volume: first(interpolate_dense(volume, crop, self.scale)),
-            lambda volume: self.head(second(volume)),
-        )
         volume = self.project(features)  # to few channels first, as all the cost is at the fine resolution
-        for part in parts:
-            if self.recompute:
-                volume = checkpoint(part, volume, use_reentrant=False, preserve_rng_state=False)
-            else:
-                volume = part(volume)
+        volume = self._run(lambda coarse: first(interpolate_dense(coarse, crop, self.scale)), volume)
+        volume = self._run(lambda fine: self.head(second(fine)), volume)
         return volume.to(self.head.weight.dtype)  # half precision ends with the convolutions
+
+    def _run(self, part: Callable[[Tensor], Tensor], volume: Tensor) -> Tensor:
+        if not self.recompute:
+            return part(volume)
+        return checkpoint(part, volume, use_reentrant=False, preserve_rng_state=False)
 
     def forward(self, grid: RadianceGrid) -> RadianceGrid:
         """Up-sample a warped grid without an inpainter: interpolation plus learned detail."""
@@ -332,6 +324,29 @@ class LearnedUpsampler(TrilinearUpsampler):
 def interpolate_dense(dense: Tensor, crop: Crop, scale: int) -> Tensor:
     """Interpolate (1, C, x, y, z) of ``crop`` to the lattice ``scale`` times finer."""
     return functional.interpolate(dense, size=crop.scaled(scale).shape, mode="trilinear", align_corners=True)
+
+
+def inpaint(
+    warped: RadianceGrid, coverage: Tensor | None, inpainter: nn.Module, upsampler: TrilinearUpsampler | None
+) -> tuple[RadianceGrid, RadianceGrid, Tensor]:
+    """Return the up-sampled grid before and after inpainting, and their difference, on the occupied box."""
+    crop = occupied_crop(warped.index, inpainter.margin)
+    dense = inputs = densify(warped, crop)
+    if inpainter.coverage_channel:
+        cover = warped.values.new_ones(len(warped.values)) if coverage is None else coverage.clamp(max=1)
+        cover = densify(warped.with_values(cover[:, None]), crop).clamp(min=0)
+        inputs = torch.cat([dense, cover], 1)
+    features = inpainter.features(inputs)
+    learned = isinstance(upsampler, LearnedUpsampler)
+    residual = upsampler.residual(features, crop) if learned else inpainter.residual(features)
+    lattice, region = warped.lattice, crop
+    if upsampler is not None:
+        scale = int(upsampler.scale)
+        lattice, region = refined(lattice, scale), crop.scaled(scale)
+        dense = interpolate_dense(dense, crop, scale)
+        residual = residual if learned else interpolate_dense(residual, crop, scale)
+    upsampled = sparsify(warped, lattice, region, dense)
+    return upsampled, sparsify(warped, lattice, region, dense + residual), residual
 
 
 class SphericalHarmonics(nn.Module):

@@ -7,19 +7,12 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from forewarp.fields.grids import DirectRadiance, RadianceGrid
+from forewarp.fields.grids import DirectRadiance
 from forewarp.methods.method import Start, those_that_hold
-from forewarp.methods.voxel.effects import (
-    LearnedUpsampler,
-    TrilinearUpsampler,
-    densify,
-    interpolate_dense,
-    occupied_crop,
-    refined,
-    sparsify,
-)
+from forewarp.methods.voxel.effects import LearnedUpsampler, TrilinearUpsampler, inpaint
 from forewarp.methods.voxel.model import Factory, VoxelMethod, VoxelSnapshot
 from forewarp.methods.voxel.structure import EFFECTS
+from forewarp.ops.backend import check_value
 from forewarp.scene.view import Moment
 
 
@@ -64,10 +57,8 @@ class ForwardWarp(VoxelMethod):
         self.motion = self.upsampler = self.inpainter = None
         self.moves = motion is not None and len(scene.times) > 1
         if self.moves:
-            if trajectory is None:
-                raise ValueError(
-                    "model.trajectory: expected a factory, but got null; choose another model/motion or model"
-                )
+            other = "choose another model/motion or model"
+            check_value("model.trajectory", trajectory, "a factory", callable, other)
             times = {"frames": len(scene.times), "canonical_time": scene.canonical_time}
             self.motion = motion(trajectory(scene.box, **times, voxels=self.radiance.lattice))
         inpainter = None if inpainter is None else inpainter(channels=channels, head=not learned)
@@ -75,12 +66,10 @@ class ForwardWarp(VoxelMethod):
             asked = {"channels": channels, "features": getattr(inpainter, "width", 0)} if learned else {}
             self.upsampler = upsampler(**asked)
         self.inpainter = inpainter
-        scale = getattr(self.upsampler, "scale", 1)
-        if inpainter is not None and scale != int(scale):
-            raise ValueError(
-                f"model.upsampler.scale: expected a whole number beside an inpainter, but got {scale}; "
-                "set it to 2, or choose model/inpainter=none"
-            )
+        if inpainter is not None:
+            scale, wanted = getattr(self.upsampler, "scale", 1), "a whole number beside an inpainter"
+            other = "set it to 2, or choose model/inpainter=none"
+            check_value("model.upsampler.scale", scale, wanted, lambda scale: scale == int(scale), other)
         self.begin(start)
 
     def at(self, moment: Moment) -> VoxelSnapshot:
@@ -94,7 +83,8 @@ class ForwardWarp(VoxelMethod):
             upsampled, difference = warped if self.upsampler is None else self.upsampler(warped), None
             fields = {self.first_rendering: upsampled}  # V_RUp
         else:
-            fields, difference = self._inpaint(warped, coverage)  # V_RUp, V_RInp
+            upsampled, inpainted, difference = inpaint(warped, coverage, self.inpainter, self.upsampler)
+            fields = {self.first_rendering: upsampled, "inpainted": inpainted}  # V_RUp, V_RInp
         found = {"flow": flow, "coverage": coverage, "dropped": dropped, "inpaint_difference": difference}
         length = 2 / 3 * self.half_extent if self.moves else 1.0
         return self.snapshot(moment, fields, canonical, length=length, **found)
@@ -128,29 +118,6 @@ class ForwardWarp(VoxelMethod):
     def first_rendering(self) -> str:
         """Name of the rendering without inpainting: ``upsampled``, or ``warped`` without an up-sampler."""
         return "warped" if self.upsampler is None else "upsampled"
-
-    def _inpaint(
-        self, warped: RadianceGrid, coverage: Tensor | None
-    ) -> tuple[dict[str, RadianceGrid], Tensor]:
-        """Return the grid before and after inpainting, and their difference, on the occupied box."""
-        crop = occupied_crop(warped.index, self.inpainter.margin)
-        dense = inputs = densify(warped, crop)
-        if self.inpainter.coverage_channel:
-            cover = warped.values.new_ones(len(warped.values)) if coverage is None else coverage.clamp(max=1)
-            cover = densify(warped.with_values(cover[:, None]), crop).clamp(min=0)
-            inputs = torch.cat([dense, cover], 1)
-        features = self.inpainter.features(inputs)
-        learned = isinstance(self.upsampler, LearnedUpsampler)
-        residual = self.upsampler.residual(features, crop) if learned else self.inpainter.residual(features)
-        lattice, region = warped.lattice, crop
-        if self.upsampler is not None:
-            scale = int(self.upsampler.scale)
-            lattice, region = refined(lattice, scale), crop.scaled(scale)
-            dense = interpolate_dense(dense, crop, scale)
-            residual = residual if learned else interpolate_dense(residual, crop, scale)
-        upsampled = sparsify(warped, lattice, region, dense)
-        inpainted = sparsify(warped, lattice, region, dense + residual)
-        return {self.first_rendering: upsampled, "inpainted": inpainted}, residual
 
     def advance(self, progress: float, step: int, optimizer: torch.optim.Optimizer) -> dict[str, float]:
         """Follow the schedules of the lattices and of the trajectory bases."""

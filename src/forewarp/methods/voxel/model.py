@@ -17,12 +17,14 @@ from forewarp.fields.grids import (
     FieldAtTime,
     RadianceGrid,
     Shade,
+    VoxelGrid,
     mean_color,
     shaded,
 )
 from forewarp.methods.method import Method, Snapshot, Start, Step
 from forewarp.methods.voxel.effects import Together
 from forewarp.methods.voxel.structure import VoxelStage, first_voxels, refresh, resample
+from forewarp.ops.backend import check_value
 from forewarp.ops.grid import neighbour_pairs
 from forewarp.ops.march import warm_up
 from forewarp.renderer import Marched, Renderer
@@ -182,20 +184,19 @@ class VoxelMethod(Method):
             ValueError: for what is neither a factory nor None, such as a number set in an option that was
                 then switched off.
         """
-        if option is not None and not callable(option):
-            raise ValueError(
-                f"model.{name}: expected a factory or null, but got {option!r}; "
-                f"choose model/{name}=none to switch it off"
-            )
+        if option is not None:
+            off = f"choose model/{name}=none to switch it off"
+            check_value(f"model.{name}", option, "a factory or null", callable, off)
         return option if name in self.stage.effects else None
 
     def begin(self, start: Start) -> None:
         """Take over what the stage before has learned, or start with faint matter; prepare the loss terms."""
         before = _carried(start, self.stage)
         if before is not None:
-            grids = self._grids()
-            for place, grid in before._grids().items():  # F2's features; those of voxels are resampled by now
-                if place in grids and grid.lattice != grids[place].lattice:
+            grids = dict(self.named_modules())
+            for place, grid in before.named_modules():
+                # F2's features; those of voxels are resampled by now.
+                if place in grids and isinstance(grid, VoxelGrid) and grid.lattice != grids[place].lattice:
                     empty = dict.fromkeys(grid.names, 0.0)
                     grid.resample(grids[place].lattice, grids[place].index >= 0, empty)
             for key in self.grids.keys() - before.grids.keys():  # a background that only this stage has
@@ -223,11 +224,9 @@ class VoxelMethod(Method):
         return VoxelSnapshot(moment, fields, canonical, self.renderer, shade, background=static, **found)
 
     @classmethod
-    def check(
-        cls, stage: str, numbers: Mapping[str, Any], terms: Iterable[str], literal: Iterable[str] = ()
-    ) -> None:
+    def check(cls, stage: str, numbers: Mapping[str, Any], *names: Iterable[str]) -> None:
         """See ``Method.check``; also refuse numbers out of range."""
-        super().check(stage, numbers, terms, literal)
+        super().check(stage, numbers, *names)
         if numbers:
             VoxelStage(name=stage, **numbers)
 
@@ -241,11 +240,8 @@ class VoxelMethod(Method):
             for name in self._compared(state)
         }
         best = list(renderings.values())[-1]
-        noted = {
-            "occupied_voxels": len(state.canonical.values),
-            "samples": best.samples,
-            "dropped_voxels": state.dropped,
-        }
+        noted = {"occupied_voxels": len(state.canonical.values), "samples": best.samples}
+        noted["dropped_voxels"] = state.dropped
         if state.coverage is not None:
             noted["coverage"] = float(state.coverage.detach().clamp(max=1).mean())
         terms = self.terms_of(state, renderings, rgb, generator)
@@ -267,8 +263,8 @@ class VoxelMethod(Method):
         """
         seen, canonical, literal = renderings.values(), state.canonical, self.printed
 
-        def photo() -> Tensor:
-            return sum(losses.photometric(r.rgb, rgb, literal="photo" in literal) for r in seen)
+        def of(effect: Any, loss: Callable[[Any], Tensor]) -> Callable[[], Tensor | None]:
+            return lambda: None if effect is None else loss(effect)
 
         def point_color() -> Tensor:
             ids = [r.all_ray_ids if "point_color" in literal else None for r in seen]
@@ -280,38 +276,33 @@ class VoxelMethod(Method):
                 return sum(losses.sample_entropy(r.all_weights) for r in seen)
             return sum(losses.background_entropy(r.transmittance) for r in seen)
 
-        def flow_l1() -> Tensor | None:
-            return None if state.flow is None else losses.flow_l1(state.flow / state.length)
-
-        def inpaint_diff() -> Tensor | None:
-            residual = state.inpaint_difference
-            return None if residual is None else losses.inpaint_diff(residual)
-
         def tv_density() -> Tensor:
             grids = [grid for grid in (canonical, state.background) if grid is not None]
             return sum(losses.tv_density(g.raw_density, self._neighbours(g.index)) for g in grids)
 
-        def tv_flow() -> Tensor | None:
-            if state.flow is None:
-                return None
-            return losses.tv_flow(state.flow / state.length, self._neighbours(canonical.index))
-
-        def tv_depth() -> Tensor:
-            return losses.tv_depth(*self._patches_of(state, generator))
+        def tv_flow(flow: Tensor) -> Tensor:
+            return losses.tv_flow(flow / state.length, self._neighbours(canonical.index))
 
         def static_points() -> Tensor | None:
             stray = self._stray(state.moment.time, generator)
             return None if stray is None else losses.static_points(stray)
 
-        def moving_opacity() -> Tensor | None:
-            if state.background is None:
-                return None
+        def moving_opacity(_: RadianceGrid) -> Tensor:
             alpha = canonical.activation.alpha(canonical.raw_density, canonical.lattice.voxel_size)
             return losses.moving_opacity(alpha)
 
-        terms = (photo, point_color, background_entropy, flow_l1, inpaint_diff)
-        terms += (tv_density, tv_flow, tv_depth, static_points, moving_opacity)
-        return {term.__name__: term for term in terms}
+        return {
+            "photo": lambda: sum(losses.photometric(r.rgb, rgb, literal="photo" in literal) for r in seen),
+            "point_color": point_color,
+            "background_entropy": background_entropy,
+            "flow_l1": of(state.flow, lambda flow: losses.flow_l1(flow / state.length)),
+            "inpaint_diff": of(state.inpaint_difference, losses.inpaint_diff),
+            "tv_density": tv_density,
+            "tv_flow": of(state.flow, tv_flow),
+            "tv_depth": lambda: losses.tv_depth(*self._patches_of(state, generator)),
+            "static_points": static_points,
+            "moving_opacity": of(state.background, moving_opacity),
+        }
 
     def _compared(self, state: VoxelSnapshot) -> list[str]:
         """Names of the renderings that the per-ray terms compare: those in ``photo_on``, or all.
@@ -365,15 +356,14 @@ class VoxelMethod(Method):
         for key, grid in self.grids.items():
             (present, since), num_voxels = self.followed[key], stage.at(key, progress)
             only_seen = stage.see_steps > 0 and step - since >= stage.see_steps
-            common = {"keep_alpha": stage.keep_alpha, "optimizer": optimizer, "only_seen": only_seen}
             if num_voxels != present:
-                resample(grid, grid.lattice.box, num_voxels, **common)
+                resample(grid, stage, optimizer, Lattice.of_count(grid.lattice.box, num_voxels), only_seen)
                 self.followed[key] = [num_voxels, step]
             elif due and progress >= stage.refresh_from:
                 confined = key == "num_voxels" and progress < stage.confine
                 confined = confined and self.home.shape == grid.lattice.shape
                 allowed = self.home.to(grid.index.device) if confined else None
-                refresh(grid, birth_alpha=stage.birth_alpha, allowed=allowed, **common)
+                refresh(grid, stage, optimizer, only_seen, allowed)
         return {}
 
     def moved(self, points: Tensor, rows: Tensor, time: float) -> Tensor:
@@ -458,9 +448,8 @@ def _resampled(
 
     ``key`` is that of the grid's schedule.
     """
-    num_voxels = stage.at(key, 0.0)
+    lattice = Lattice.of_count(box, stage.at(key, 0.0))
     if before is None:
-        lattice = Lattice.of_count(box, num_voxels)
         return lattice, torch.ones(lattice.shape, dtype=torch.bool)
-    resample(before, box, num_voxels, keep_alpha=stage.keep_alpha)
-    return before.lattice, before.index >= 0
+    resample(before, stage, None, lattice)
+    return lattice, before.index >= 0

@@ -7,13 +7,15 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
+from torch.optim import Optimizer
 
 from forewarp.fields.grids import EMPTY, VoxelGrid
 from forewarp.methods.effect import Effect, Evidence
-from forewarp.methods.method import FRACTION, Start, check_number, steps_of, value_at
+from forewarp.methods.method import FRACTION, Start, check_effects, check_number, steps_of, value_at
 from forewarp.methods.rows import renew_parameters
+from forewarp.ops.backend import check_value
 from forewarp.ops.grid import dilate, trilinear
-from forewarp.scene.box import Box, Lattice
+from forewarp.scene.box import Lattice
 from forewarp.scene.frame import visual_hull
 
 EFFECTS = (
@@ -87,20 +89,15 @@ class VoxelStage:
         where = f"stage.{self.name}"
         for key in ("num_voxels", "background_num_voxels", *(["bases"] if self.bases else [])):
             steps_of(f"{where}.{key}", getattr(self, key))
-        if not set(self.effects) <= set(NAMES):
-            raise ValueError(
-                f"{where}.effects: expected some of {', '.join(NAMES)}, but got {list(self.effects)}"
-            )
-        if self.start not in ("auto", "box", "hull"):
-            raise ValueError(f"{where}.start: expected auto, box or hull, but got '{self.start}'")
+        check_effects(f"{where}.effects", self.effects, NAMES)
+        starts = ("auto", "box", "hull")
+        check_value(f"{where}.start", self.start, "auto, box or hull", starts.__contains__)
         check_number(f"{where}.confine", self.confine, *FRACTION)
         for key in ("box_alpha", "start_alpha"):
             check_number(f"{where}.{key}", getattr(self, key), "a number in (0, 1)", lambda a: 0 < a < 1)
-        if not 0 < self.birth_alpha < self.keep_alpha < 1:
-            raise ValueError(
-                f"{where}: expected 0 < birth_alpha < keep_alpha < 1, or fog spreads, "
-                f"but got {self.birth_alpha}, {self.keep_alpha}"
-            )
+        wanted = "0 < birth_alpha < keep_alpha < 1, or fog spreads"
+        alphas = self.birth_alpha, self.keep_alpha
+        check_value(where, alphas, wanted, lambda pair: 0 < pair[0] < pair[1] < 1)
 
     def at(self, key: str, fraction: float) -> float | None:
         """Return the value of the schedule ``key`` at a fraction; None if it is empty."""
@@ -117,10 +114,8 @@ def first_voxels(start: Start, stage: VoxelStage, lattice: Lattice) -> Tensor:
     if start.blank or not hull:
         return everywhere
     if not scene.has_alpha:
-        raise ValueError(
-            f"stage.{start.stage}.start: expected box, since the images of '{scene.name}' have no alpha, "
-            "but got hull"
-        )
+        why = f"since the images of '{scene.name}' have no alpha"
+        raise ValueError(f"stage.{start.stage}.start: expected box, {why}, but got hull")
     frames, count = [scene.train[i] for i in start.frames], stage.hull_frames
     while count < len(frames) and frames[count].time == frames[count - 1].time:
         count += 1  # all views of each time: some neighbouring cameras alone bound nothing
@@ -132,7 +127,7 @@ def first_voxels(start: Start, stage: VoxelStage, lattice: Lattice) -> Tensor:
     return inside.reshape(lattice.shape) if bool(inside.any()) else everywhere
 
 
-def seen_rows(radiance: VoxelGrid, optimizer: torch.optim.Optimizer) -> Tensor:
+def seen_rows(radiance: VoxelGrid, optimizer: Optimizer) -> Tensor:
     """Voxels (N,) bool that some view has seen: their colour has had a gradient since the moments began."""
     name = "color" if "color" in radiance.names else radiance.names[0]
     moments = optimizer.state.get(radiance.parameter(name), {}).get("exp_avg_sq")
@@ -143,74 +138,55 @@ def seen_rows(radiance: VoxelGrid, optimizer: torch.optim.Optimizer) -> Tensor:
 
 @torch.no_grad()
 def refresh(
-    radiance: VoxelGrid,
-    optimizer: torch.optim.Optimizer,
-    *,
-    keep_alpha: float,
-    birth_alpha: float,
-    only_seen: bool = False,
-    allowed: Tensor | None = None,
-) -> bool:
+    radiance: VoxelGrid, stage: VoxelStage, optimizer: Optimizer, only_seen: bool, allowed: Tensor | None
+) -> None:
     """Activate the occupied voxels and their neighbours, and deactivate all others.
 
     Leave an empty grid as it is, so that a scene that has not appeared yet can still appear.
 
     Args:
         radiance: the grid; its active voxels change in place.
+        stage: for ``keep_alpha``, above which a voxel is occupied, and ``birth_alpha``, of new ones.
         optimizer: its moments follow the rows.
-        keep_alpha: opacity over one voxel above which a voxel is occupied.
-        birth_alpha: opacity of a new voxel; below ``keep_alpha``, or fog spreads.
         only_seen: also deactivate voxels that no view has seen, inside of solid objects.
         allowed: (X, Y, Z) bool, where voxels may become active; None: anywhere.
-
-    Returns:
-        whether the active voxels changed.
     """
     grid = radiance()
-    solid = grid.activation.alpha(grid.raw_density, grid.lattice.voxel_size) > keep_alpha
+    solid = grid.activation.alpha(grid.raw_density, grid.lattice.voxel_size) > stage.keep_alpha
     if only_seen:
         solid = solid & seen_rows(radiance, optimizer)
     mask = torch.zeros(grid.lattice.shape, dtype=torch.bool, device=solid.device)
     mask[radiance.voxels[solid].unbind(-1)] = True
     active = dilate(mask, 1) if allowed is None else (dilate(mask, 1) & allowed) | mask
-    if not bool(mask.any()) or torch.equal(active, radiance.index >= 0):
-        return False
-    before = radiance.rows()
-    rows = radiance.activate(active, radiance.births(birth_alpha))
-    renew_parameters(optimizer, before, radiance.rows(), rows)
-    return True
+    if bool(mask.any()) and not torch.equal(active, radiance.index >= 0):
+        before = radiance.rows()
+        rows = radiance.activate(active, radiance.births(stage.birth_alpha))
+        renew_parameters(optimizer, before, radiance.rows(), rows)
 
 
 @torch.no_grad()
 def resample(
-    radiance: VoxelGrid,
-    box: Box,
-    num_voxels: float,
-    *,
-    keep_alpha: float,
-    optimizer: torch.optim.Optimizer | None = None,
-    only_seen: bool = False,
+    grid: VoxelGrid, stage: VoxelStage, optimizer: Optimizer | None, lattice: Lattice, only_seen: bool = False
 ) -> None:
-    """Resample the grid to a lattice of about ``num_voxels`` over ``box``.
+    """Resample the grid to another lattice.
 
-    Activate the occupied voxels and their neighbours; if none is occupied, all. The grid's moments in the
-    optimiser start at 0.
+    Activate the voxels that are occupied by the stage's ``keep_alpha`` and their neighbours; if none is, all.
+    The grid's moments in the optimiser start at 0. ``only_seen``: as of ``refresh``.
     """
-    source = radiance()
-    lattice = Lattice.of_count(box, num_voxels)
+    source = grid()
     points = source.lattice.to_lattice(lattice.to_world(lattice.all_voxels(source.values.device)))
     raw = source.values[:, :1].detach()
     if only_seen and optimizer is not None:
-        raw = torch.where(seen_rows(radiance, optimizer)[:, None], raw, EMPTY)
+        raw = torch.where(seen_rows(grid, optimizer)[:, None], raw, EMPTY)
     raw = trilinear(raw.contiguous(), source.index, points, source.fill[:1])[:, 0]
     last = torch.tensor(source.lattice.shape, device=points.device) - 1
     slack = 1e-3  # in voxels: keep the border of an equal box in spite of rounding
     inside = ((points >= -slack) & (points <= last + slack)).all(-1)
-    solid = (source.activation.alpha(raw, source.lattice.voxel_size) > keep_alpha) & inside
+    solid = (source.activation.alpha(raw, source.lattice.voxel_size) > stage.keep_alpha) & inside
     mask = dilate(solid.reshape(lattice.shape), 1)
     if not bool(mask.any()):
         mask = torch.ones_like(mask)
-    before = radiance.rows()
-    radiance.resample(lattice, mask, radiance.empties())
+    before = grid.rows()
+    grid.resample(lattice, mask, grid.empties())
     if optimizer is not None:
-        renew_parameters(optimizer, before, radiance.rows(), None)
+        renew_parameters(optimizer, before, grid.rows(), None)
