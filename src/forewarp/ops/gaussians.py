@@ -16,7 +16,7 @@ from torch.autograd.function import once_differentiable
 from torch.nn.functional import pad
 from torch.utils.checkpoint import checkpoint
 
-from forewarp.ops.backend import arrays, check_shape, match_threads, use_numba
+from forewarp.ops.backend import arrays, check_shapes, match_threads, use_numba
 from forewarp.ops.lens import distort_with_jacobian
 
 BLUR = 0.1  # square pixels; a pixel alone has a variance of 1/12
@@ -150,18 +150,18 @@ def project(
     )
 
 
+_SHAPES = "means (N, 3), log_scales (N, 3), quaternions (N, 4), opacity (N, F), colors (N, B, 3)"
+_SHAPES += ", maps (M, 12), links (N, L), weights (N, L)"
+
+
 def _check(particles: Gaussians, warp: Warp, color_basis: Tensor, opacity_basis: Tensor) -> None:
-    count, plain = len(particles.means), particles.colors.shape[1] - len(color_basis)
-    for name, shape in zip(Gaussians._fields, ((3,), (3,), (4,), (len(opacity_basis),), ("B", 3))):
-        check_shape(name, getattr(particles, name), (count, *shape))
+    check_shapes(_SHAPES, *particles, *warp, F=len(opacity_basis))
+    plain = particles.colors.shape[1] - len(color_basis)
     if plain not in (1, 4, 9, 16):
         raise ValueError(
             f"colors: expected 1, 4, 9 or 16 coefficients of direction beside {len(color_basis)} of time, "
             f"but got {plain}"
         )
-    check_shape("maps", warp.maps, ("M", 12))
-    check_shape("links", warp.links, (count, "L"))
-    check_shape("weights", warp.weights, tuple(warp.links.shape))
 
 
 def harmonics(directions: Tensor, count: int) -> Tensor:
@@ -355,8 +355,7 @@ def rasterize(splats: Splats, width: int, height: int, chunk: int = CHUNK) -> Im
     Cost: of the kernel, about 60 ns a splat and tile that it touches and 10 ns a splat; of the reference,
     some 50 bytes of memory for each pair of a chunk.
     """
-    check_shape("splats.values", splats.values, ("N", COLUMN.depth + 1))
-    check_shape("splats.reach", splats.reach, (len(splats.values), 2))
+    check_shapes("splats.values (N, 10), splats.reach (N, 2)", *splats)
     if width < 1 or height < 1:
         raise ValueError(f"image: expected at least 1 x 1 pixels, but got {width} x {height}")
     if use_numba(splats.values) and splats.values.dtype == torch.float32:
@@ -599,8 +598,8 @@ def compare(
     of the loss.
     """
     _check(particles, warp, color_basis, opacity_basis)
-    check_shape("pixels", pixels, (pinhole.size[0] * pinhole.size[1], 4))
-    check_shape("background", background, (3,))
+    count = math.prod(pinhole.size)
+    check_shapes("pixels (P, 4), background (3)", pixels, background, P=count)
     if pixels.dtype != torch.uint8 or not width > 0:
         raise ValueError(f"compare: expected uint8 pixels and width > 0, but got {pixels.dtype}, {width=}")
     if kinds is not None and sum(kinds) != particles.colors.shape[1]:
@@ -608,9 +607,9 @@ def compare(
             f"kinds: expected {particles.colors.shape[1]} coefficients in all, but got {tuple(kinds)}"
         )
     seen = particles, warp, pinhole, color_basis, opacity_basis
-    for name, plane, shape in (("valid", valid, (len(pixels),)), ("sensed", sensed, (2, len(pixels)))):
+    for shape, plane in (("valid (P)", valid), ("sensed (2, P)", sensed)):
         if plane is not None:
-            check_shape(name, plane, shape)
+            check_shapes(shape, plane, P=count)
     given = pixels, background, width, factor, by_skin, kinds
     beside = valid, sensed, by_depth, deep
     if loss is None and use_numba(particles.means) and particles.means.dtype == torch.float32:
