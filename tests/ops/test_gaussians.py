@@ -59,9 +59,9 @@ def test_project_hand_worked(backend):
     determinant = wide * high - beside**2
     assert (x, y) == pytest.approx((9.0, 6.0))
     assert (a, b, c) == pytest.approx((high / determinant, -beside / determinant, wide / determinant))
-    assert splats.opacity.item() == pytest.approx(0.75)
-    assert splats.rgb[0].tolist() == pytest.approx([0.6, 0.7, 0.0], abs=1e-6)  # never below 0
-    assert splats.depth.item() == pytest.approx(math.sqrt(16.05))
+    assert splats.values[0, COLUMN.opacity].item() == pytest.approx(0.75)
+    assert splats.values[0, COLUMN.red : COLUMN.depth].tolist() == pytest.approx([0.6, 0.7, 0.0], abs=1e-6)  # never below 0
+    assert splats.values[0, COLUMN.depth].item() == pytest.approx(math.sqrt(16.05))
     assert splats.reach[0, 0].item() == pytest.approx(math.sqrt(2 * math.log(255 * 0.75) * wide), rel=1e-5)
 
 
@@ -135,8 +135,8 @@ def test_extreme_particles_are_finite(backend, scale, opacity, quaternion):
 def test_time_changes_colour_and_opacity(backend):
     particles = one()._replace(opacity=torch.tensor([[0.5, 2.0]]), colors=torch.ones(1, 2, 3))
     splats = project(particles, still(particles), straight(), torch.tensor([0.1]), torch.tensor([1.0, -0.5]))
-    assert splats.opacity.item() == pytest.approx(1 / (1 + math.exp(0.5)))
-    assert splats.rgb[0, 0].item() == pytest.approx(0.5 + 0.28209479 + 0.1)
+    assert splats.values[0, COLUMN.opacity].item() == pytest.approx(1 / (1 + math.exp(0.5)))
+    assert splats.values[0, COLUMN.red].item() == pytest.approx(0.5 + 0.28209479 + 0.1)
 
 
 def test_harmonics_are_orthonormal():
@@ -300,7 +300,7 @@ def test_rasterize_by_the_kernel_equals_the_reference(size):
 
 def dense(splats, width, height):
     """The reference without tiles: a number for each splat and pixel."""
-    values = splats.values[splats.depth.detach().sort(stable=True).indices]
+    values = splats.values[splats.values.detach()[:, COLUMN.depth].sort(stable=True).indices]
     x, y, a, b, c, solid = values[:, : COLUMN.red, None, None].unbind(1)
     dx = torch.arange(width) + 0.5 - x
     dy = (torch.arange(height) + 0.5)[:, None] - y
@@ -337,7 +337,7 @@ def test_where_nothing_is_all_is_let_through(backend, splats):
 
 def test_weights_and_what_is_let_through_are_one(backend):
     splats = crowd_of(F32)
-    splats.rgb.fill_(1)
+    splats.values[:, COLUMN.red : COLUMN.depth].fill_(1)
     planes, _ = drawn(splats)
     torch.testing.assert_close(planes[0] + planes[4], torch.ones(SIZE[1], SIZE[0]))
 

@@ -77,9 +77,8 @@ def _adam_numba(states: list[AdamState], betas: tuple[float, float], eps: float)
         width, tensors = value.shape[-1], (value, alive[-1], mean, square, steps)
         table.append([*(t.data_ptr() for t in tensors), value.numel() // width, width])
     rates = np.array([state.lr for state in states], np.float32)
-    first, second = map(float, betas)
-    bias = kernels.biases(first, second)
-    kernels.adam(np.array(table, np.int64), rates, first, second, float(eps), bias)
+    betas = tuple(map(float, betas))
+    kernels.adam(np.array(table, np.int64), rates, *betas, float(eps), kernels.biases(*betas))
 
 
 def _adam_reference(state: AdamState, betas: tuple[float, float], eps: float) -> None:

@@ -159,13 +159,14 @@ def march(
 
     Cost: one test per step in blocks with occupied cells, one per empty block; memory P.
     """
-    _check_march(origins, directions, near, far, step, jitter)
+    rays = origins, directions, near, far, step, cells, jitter
+    _check_march(*rays)
     if not use_numba(origins):
-        return march_reference(origins, directions, near, far, step, cells, jitter)
+        return march_reference(*rays)
     from forewarp.ops.kernels import voxels as kernels
 
     counts, firsts = torch.zeros(2, len(origins), dtype=torch.int64).unbind()
-    common = (*_march_arrays(origins, directions, near, far, step, cells, jitter), *arrays(counts, firsts))
+    common = (*_march_arrays(*rays), *arrays(counts, firsts))
     kernels.march(*common, *arrays(counts[:0], counts[:0], origins[:0, 0]))
     starts, total = counts.cumsum(0) - counts, int(counts.sum())
     ray_ids, distances = counts.new_empty(total), origins.new_empty(total)
@@ -173,9 +174,7 @@ def march(
     return ray_ids, distances
 
 
-def _check_march(
-    origins: Tensor, directions: Tensor, near: float, far: float, step: float, jitter: Tensor
-) -> None:
+def _check_march(origins, directions, near, far, step, cells, jitter) -> None:
     check_shapes("origins (R, 3), directions (R, 3), jitter (R)", origins, directions, jitter)
     if not (step > 0 and math.isfinite(step)) or not 0 <= near < far < math.inf:
         raise ValueError(f"march: expected step > 0 and 0 <= near < far, but got {step=}, {near=}, {far=}")
@@ -259,16 +258,16 @@ def trace(
 
     Cost: one read of 8 voxels per sample up to a ray's end, twice for returned samples; memory P.
     """
-    _check_march(origins, directions, near, far, step, jitter)
+    rays = origins, directions, near, far, step, cells, jitter
+    _check_march(*rays)
     sizes = {axis: n + 1 for axis, n in zip("XYZ", cells.shape)}
     check_shapes("raw (M), index (X, Y, Z)", raw, index, **sizes)
     from forewarp.ops.kernels import voxels as kernels
 
     sums = torch.zeros(len(origins), 4, dtype=torch.float64)
     read, counts, firsts = torch.zeros(3, len(origins), dtype=torch.int64).unbind()
-    numbers = map(float, (fill, shift, scale, early_stop_eps, threshold))
-    common = (*_march_arrays(origins, directions, near, far, step, cells, jitter), *arrays(raw, index))
-    common = (*common, *numbers, *arrays(sums, read, counts, firsts))
+    field = (*arrays(raw, index), *map(float, (fill, shift, scale, early_stop_eps, threshold)))
+    common = (*_march_arrays(*rays), *field, *arrays(sums, read, counts, firsts))
     kernels.trace(*common, *arrays(counts[:0], counts[:0], origins[:0, 0], origins[:0, 0]))
     starts, total = counts.cumsum(0) - counts, int(counts.sum())
     ids, distances, weights = counts.new_empty(total), *origins.new_empty(2, total).unbind()

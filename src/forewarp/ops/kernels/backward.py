@@ -124,12 +124,8 @@ def _by_quaternion(place, d):
     gy = (w * (d[2] - d[6]) + x * (d[1] + d[3]) + z * (d[5] + d[7]) - y * (d[0] + d[8]) * 2.0) * 2.0
     gz = (w * (d[3] - d[1]) + x * (d[2] + d[6]) + y * (d[5] + d[7]) - z * (d[0] + d[4]) * 2.0) * 2.0
     along = gw * w + gx * x + gy * y + gz * z
-    return (
-        (gw - along * w) * length,
-        (gx - along * x) * length,
-        (gy - along * y) * length,
-        (gz - along * z) * length,
-    )
+    gw, gx, gy, gz = gw - along * w, gx - along * x, gy - along * y, gz - along * z
+    return gw * length, gx * length, gy * length, gz * length
 
 
 @njit(forceinline=True)

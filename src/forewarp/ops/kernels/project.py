@@ -241,19 +241,9 @@ def _squared_reach(camera, ahead, beside, lens, determinant, opacity, log_opacit
 
 @njit(parallel=True, cache=True)
 def project(
-    means,
-    log_scales,
-    quaternions,
-    opacity,
-    colors,
-    maps,
-    links,
-    weights,
-    camera,
-    color_basis,
-    opacity_basis,
+    means, log_scales, quaternions, opacity, colors, maps, links, weights, camera, color_basis, opacity_basis,
     out,
-):
+):  # fmt: skip
     """Fill ``out`` (N', 16) with splats; see ``gaussians.project``. N' is N or more, a multiple of 16.
 
     A splat: x, y, conic (3), opacity, colour (3), depth, how far it reaches along both axes (one that is not
