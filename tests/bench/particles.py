@@ -209,11 +209,11 @@ class Loop:
 STEPS, FEW = 40, 5  # repetitions: of what takes milliseconds, of what takes long
 # Of which kernels a part consists: the module's name in ``ops.kernels``, and its functions; none named: all.
 PARTS = {
-    "projection": (("project", ()),),
+    "projection": (("project", ("project",)),),
     "sorting into tiles": (("rasterize", ("sort_into_tiles",)),),
     "forward: a picture's": (("rasterize", ("draw",)),),
     "forward, loss and backward": (("rasterize", ("compare",)),),
-    "chain, back to particles and nodes": (("backward", ()),),
+    "chain, back to particles and nodes": (("project", ("splat_gradients", "chain")),),
     "nodes": (("nodes", ("carry", "pull", "spread")),),
     "weights of nodes": (("nodes", ("weigh",)),),
     "optimiser": (("adam", ()),),

@@ -287,7 +287,7 @@ def _chain(inputs, splats, seen, by_splat, threads, kinds, *, by_weights=True, s
         tensor of their own; by maps; and by weights, or by the numbers whose softmax they are, if
         ``by_weights``.
     """
-    from forewarp.ops.kernels import backward as kernels
+    from forewarp.ops.kernels import project as kernels
 
     count, starts = len(inputs[0]), accumulate(kinds, initial=0)
     gradients = [torch.empty(t.shape) for t in inputs[:4]]
@@ -490,7 +490,7 @@ def _splat_gradients(splats: Tensor, tiles: _Tiles, sums: Tensor, factor: float)
     """Return the rows of splats that are seen, ``factor`` times the gradients by their columns (V', 16), from
     sums over pixels, and the lengths (N,) of those by the pixel.
     """
-    from forewarp.ops.kernels import backward as kernels
+    from forewarp.ops.kernels import project as kernels
 
     # Rows lie side by side in memory: in the order of depth half of the time would be waiting.
     ranks = np.full(len(splats), -1, np.int32)
