@@ -203,9 +203,8 @@ def test_the_kernel_serves_only_where_nothing_else_is_asked_for(monkeypatch):
     "wrong", [{"step": 0.0}, {"color_threshold": 1.0}, {"color_threshold": -0.1}, {"early_stop_eps": 1.0}]
 )
 def test_refuses(wrong):
-    with pytest.raises(
-        ValueError, match="renderer: expected step > 0 and 0 <= color_threshold < 1 and 0 <= early"
-    ):
+    says = "renderer: expected step > 0 and 0 <= color_threshold < 1 and 0 <= early"
+    with pytest.raises(ValueError, match=says):
         Renderer(**wrong)
 
 
@@ -234,9 +233,8 @@ def slab(strength, low=-0.5, high=0.5):
 
 
 def along_x(count=3):
-    return Rays(
-        torch.tensor([[-3.0, 0, 0]]).repeat(count, 1), torch.tensor([[1.0, 0, 0]]).repeat(count, 1), 1, 5
-    )
+    origin, direction = torch.tensor([[[-3.0, 0, 0]], [[1.0, 0, 0]]]).repeat(1, count, 1)
+    return Rays(origin, direction, 1, 5)
 
 
 @pytest.mark.parametrize("open_end", [True, False])
@@ -244,9 +242,8 @@ def test_a_slab_hand_worked(open_end):
     seen = Quadrature(400, 400, open_end)(*slab(2.0), along_x(), ONES)
     through = math.exp(-2)
     torch.testing.assert_close(seen.opacity, torch.full((3,), 1 - through), atol=5e-3, rtol=0)
-    torch.testing.assert_close(
-        seen.rgb, torch.tensor([[1, through, through]]).repeat(3, 1), atol=5e-3, rtol=0
-    )
+    pink = torch.tensor([[1, through, through]]).repeat(3, 1)
+    torch.testing.assert_close(seen.rgb, pink, atol=5e-3, rtol=0)
     # The mean of an exponential that is cut off after 1, from the slab's face at 2.5.
     mean = 2.5 + 0.5 - through / (1 - through)
     torch.testing.assert_close(seen.depth, torch.full((3,), mean), atol=0.01, rtol=0)
@@ -272,12 +269,8 @@ def test_an_open_end_hides_the_background_of_a_density_that_is_never_0():
         return thin if directions is None else (thin, RED.expand(*points.shape[:2], 3))
 
     torch.testing.assert_close(Quadrature(8, 8)(fog, fog, along_x(1), ONES).rgb[0], RED)
-    torch.testing.assert_close(
-        Quadrature(8, 8, open_end=False)(fog, fog, along_x(1), ONES).rgb[0],
-        ONES,
-        atol=1e-4,
-        rtol=0,
-    )
+    closed = Quadrature(8, 8, open_end=False)(fog, fog, along_x(1), ONES)
+    torch.testing.assert_close(closed.rgb[0], ONES, atol=1e-4, rtol=0)
 
 
 def test_opacity_and_depth_leave_out_a_sample_without_end():

@@ -27,6 +27,8 @@ from forewarp.scene.box import Box
 from forewarp.scene.camera import Rays
 from forewarp.scene.view import Rendering
 
+_RAYS = 1 << 16  # of an image, marched at once
+
 
 @dataclass(frozen=True)
 class Marched(Rendering):
@@ -124,7 +126,9 @@ class Renderer:
         if plain and use_numba(field.values):
             return self._traced(field, rays, background, shade, generator)
         count, step = len(rays), self.step * field.voxel_size
-        ray_ids, distances, points = self._samples(field, rays, step, generator)
+        origins, directions, jitter = self._starts(field, rays, generator)
+        ray_ids, distances = march(origins, directions, rays.near, rays.far, step, field.cells, jitter)
+        points = origins[ray_ids] + distances[:, None] * directions[ray_ids]
         at_once = hasattr(field, "look_up")
         density, color_of = field.look_up(points) if at_once else (field.density(points), None)
         weights, transmittance = render_weights(density * step, ray_ids, count)
@@ -140,71 +144,33 @@ class Renderer:
         opacity, depth = accumulate(weights, moments, ray_ids, count).unbind(-1)
         opacity = opacity.clamp(max=1)
         depth = depth / opacity.clamp(min=1e-6)
-        return Marched(
-            rgb=rgb,
-            depth=depth,
-            opacity=opacity,
-            transmittance=transmittance,
-            weights=some_weights,
-            colors=colors,
-            ray_ids=some_rays,
-            samples=len(ray_ids),
-            all_weights=weights if keep_all_weights else None,
-            all_ray_ids=ray_ids if keep_all_weights else None,
-        )
+        every = (weights, ray_ids) if keep_all_weights else (None, None)
+        found = rgb, depth, opacity, transmittance, some_weights, colors, some_rays
+        return Marched(*found, len(ray_ids), *every)
 
-    def _traced(
-        self,
-        grid: RadianceGrid,
-        rays: Rays,
-        background: Tensor,
-        shade: Shade | None,
-        generator: torch.Generator | None,
-    ) -> Marched:
+    def _traced(self, grid: RadianceGrid, rays: Rays, background: Tensor, shade, generator) -> Marched:
         """Render without gradient by one kernel, equal within ``early_stop_eps``: skip what is hidden."""
         step, activation = self.step * grid.voxel_size, grid.activation
         origins, directions, jitter = self._starts(grid, rays, generator)
         found = trace(
-            origins,
-            directions,
-            rays.near,
-            rays.far,
-            step,
-            grid.cells,
-            jitter,
-            raw=grid.raw_density,
-            index=grid.index,
-            fill=EMPTY,
-            shift=activation.shift,
-            scale=step / activation.density_scale,
-            early_stop_eps=self.early_stop_eps,
+            origins, directions, rays.near, rays.far, step, grid.cells, jitter,
+            raw=grid.raw_density, index=grid.index, fill=EMPTY, shift=activation.shift,
+            scale=step / activation.density_scale, early_stop_eps=self.early_stop_eps,
             threshold=self.color_threshold or -1.0,  # 0 keeps all samples, even those of weight 0
-        )
+        )  # fmt: skip
         ray_ids, weights = found.ray_ids, found.weights
         points = origins[ray_ids] + found.distances[:, None] * directions[ray_ids]
         colors = grid.colors(points, rays.directions[ray_ids], shade)
-        opacity = found.opacity.clamp(max=1)
-        return Marched(
-            rgb=accumulate(weights, colors, ray_ids, len(rays)) + found.transmittance[:, None] * background,
-            depth=found.distance / opacity.clamp(min=1e-6),
-            opacity=opacity,
-            transmittance=found.transmittance,
-            weights=weights,
-            colors=colors,
-            ray_ids=ray_ids,
-            samples=found.samples,
-        )
+        opacity, through = found.opacity.clamp(max=1), found.transmittance
+        rgb = accumulate(weights, colors, ray_ids, len(rays)) + through[:, None] * background
+        depth = found.distance / opacity.clamp(min=1e-6)
+        return Marched(rgb, depth, opacity, through, weights, colors, ray_ids, found.samples)
 
     def image(
-        self,
-        field: FieldAtTime,
-        rays: Rays,
-        background: Tensor,
-        shade: Shade | None = None,
-        chunk: int = 65536,
+        self, field: FieldAtTime, rays: Rays, background: Tensor, shade: Shade | None = None
     ) -> Rendering:
-        """Render an image's rays without gradient. Cost: time linear in the rays, memory in ``chunk``."""
-        return in_chunks(lambda part: self(field, rays[part], background, shade), len(rays), chunk)
+        """Render an image's rays without gradient. Cost: time linear in the rays, memory bounded."""
+        return in_chunks(lambda part: self(field, rays[part], background, shade), len(rays), _RAYS)
 
     @staticmethod
     def _starts(
@@ -216,15 +182,6 @@ class Renderer:
         origins, directions = lattice.to_lattice(rays.origins), rays.directions / spacing
         jitter = torch.full((count,), 0.5) if generator is None else torch.rand(count, generator=generator)
         return origins, directions, jitter.to(origins)
-
-    @classmethod
-    def _samples(
-        cls, field: FieldAtTime, rays: Rays, step: float, generator: torch.Generator | None
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """Ray (P,), distance (P,) and lattice coordinates (P, 3) of each sample."""
-        origins, directions, jitter = cls._starts(field, rays, generator)
-        ray_ids, distances = march(origins, directions, rays.near, rays.far, step, field.cells, jitter)
-        return ray_ids, distances, origins[ray_ids] + distances[:, None] * directions[ray_ids]
 
 
 # Points (..., 3) -> density (...,) >= 0 per world unit.
@@ -352,12 +309,8 @@ class Quadrature:
         if len(met) == len(behind):
             return seen
         nothing = behind.new_zeros(len(behind))
-        return replace(
-            seen,
-            rgb=behind.index_copy(0, met, seen.rgb),
-            depth=nothing.index_copy(0, met, seen.depth),
-            opacity=nothing.index_copy(0, met, seen.opacity),
-        )
+        depth, opacity = (nothing.index_copy(0, met, part) for part in (seen.depth, seen.opacity))
+        return replace(seen, rgb=behind.index_copy(0, met, seen.rgb), depth=depth, opacity=opacity)
 
     def image(
         self,
@@ -369,10 +322,8 @@ class Quadrature:
     ) -> Rendering:
         """Render an image's rays without gradient. Cost: time linear in the rays, memory bounded."""
         chunk = max(1, _POINTS // (self.samples + self.fine_samples))
-        behind = background.expand(len(rays), 3)
-        return in_chunks(
-            lambda part: self(density, radiance, rays[part], behind[part], generator), len(rays), chunk
-        )
+        behind, fields = background.expand(len(rays), 3), (density, radiance)
+        return in_chunks(lambda part: self(*fields, rays[part], behind[part], generator), len(rays), chunk)
 
     def _stretch(self, rays: Rays) -> tuple[Tensor, Tensor]:
         """Return where each ray starts and ends, (R,) each."""
@@ -399,9 +350,8 @@ class Quadrature:
 
 def _placed(kept: Tensor, values: Tensor) -> Tensor:
     """Put values (P, ...) of the kept samples where they are in (R, S, ...), 0 elsewhere."""
-    return values.new_zeros(*kept.shape, *values.shape[1:]).masked_scatter(
-        kept.reshape(*kept.shape, *[1] * (values.dim() - 1)), values
-    )
+    mask = kept.reshape(*kept.shape, *[1] * (values.dim() - 1))
+    return values.new_zeros(*kept.shape, *values.shape[1:]).masked_scatter(mask, values)
 
 
 def _points(rays: Rays, depths: Tensor) -> Tensor:

@@ -29,19 +29,13 @@ from forewarp.drawing.images import in_a_row, to_bytes, write_video
 from forewarp.drawing.images import read_image as read_drawn
 from forewarp.progress import Counted
 from forewarp.scene.box import Box
+from forewarp.scene.camera import Camera
 from forewarp.synth.walks import cameras_of
 from tests.support.captures import WALKS, pictures_of, pose_errors, smeared
 
 FRAMES, SECONDS, SHAKEN = 120, 8.0, 4  # every fourth frame is blurred
 GAP = 8  # pixels between pictures
-TRAIN = [
-    "data.scale=2",
-    "trainer=cpu",
-    "logger=none",
-    "callbacks.pictures=null",
-    "budget.minutes=null",
-    "threads=1",
-]
+TRAIN = ("trainer=cpu", "logger=none", "callbacks.pictures=null", "threads=1")
 
 
 def film(name: str, folder: Path) -> tuple[Path, list]:
@@ -86,6 +80,15 @@ def compared(found: Path, true: list, frame_of) -> tuple[dict, object]:
     }, similarity
 
 
+def in_world_of(similarity, camera: Camera) -> Camera:
+    """Return a true camera in the captured world, from which a similarity leads to the true one."""
+    pose = torch.eye(4, dtype=torch.float64)
+    pose[:3, :3] = torch.from_numpy(similarity.turn.T) @ camera.camera_to_world[:3, :3]
+    place = (np.asarray(camera.center) - similarity.shift) @ similarity.turn / similarity.scale
+    pose[:3, 3] = torch.from_numpy(place)
+    return replace(camera, camera_to_world=pose)
+
+
 def with_true_poses(found: Path, folder: Path, true: list, frame_of, similarity) -> None:
     """Write the captured pictures, half as large, with the true cameras in the found world."""
     content, scene = json.loads((found / "transforms.json").read_text()), read_scene(found.parent, found.name)
@@ -94,22 +97,18 @@ def with_true_poses(found: Path, folder: Path, true: list, frame_of, similarity)
         (path,) = (found / "images_2").glob(f"{Path(frame.name).name}.*")
         name, pixels = path.name, read_image(path)[..., :3]
         camera = true[frame_of(name)].resized(pixels.shape[1], pixels.shape[0])
-        pose = torch.eye(4, dtype=torch.float64)
-        pose[:3, :3] = torch.from_numpy(similarity.turn.T) @ camera.camera_to_world[:3, :3]
-        place = (np.asarray(camera.center) - similarity.shift) @ similarity.turn / similarity.scale
-        pose[:3, 3] = torch.from_numpy(place)
-        shots.append(PosedShot(name, replace(camera, camera_to_world=pose), pixels, frame.time))
+        shots.append(PosedShot(name, in_world_of(similarity, camera), pixels, frame.time))
     limits = {key: content[key] for key in ("near", "far")} | {"aabb": Box(*content["aabb"])}
     write_scene(folder, shots, **limits, points=np.load(found / "points.npy"))
 
 
-def fitted(root: Path, scene: str, run: Path, steps: int, seed: int, *words) -> dict:
+def fitted(scene: Path, run: Path, *words: str) -> dict:
     """Fit a scene, unless a run of that name has finished; return its scores and processor seconds."""
     if not (run / "seconds.json").exists():
-        options = [f"data.root={root}", f"data.scene={scene}", f"run={run}", f"seed={seed}", *TRAIN, *words]
-        spent = called("train", "experiment=video_with_poses", f"budget.iterations={steps}", *options)
+        options = [f"data.root={scene.parent}", f"data.scene={scene.name}", f"run={run}", *TRAIN, *words]
+        spent = called("train", "experiment=video_with_poses", *options)
         (run / "seconds.json").write_text(json.dumps(spent))
-    scores = json.loads((run / "metrics.json").read_text())["test"]["all"]
+    scores = json.loads((run / "metrics.json").read_text())["test"]
     return {**scores, "seconds": json.loads((run / "seconds.json").read_text())}
 
 
@@ -133,11 +132,14 @@ def proof(name: str, folder: Path, steps: int, seeds: list[int]) -> dict:
 def fits(found: Path, folder: Path, true: list, frame_of, similarity, steps: int, seeds: list[int]) -> dict:
     """Fit with the found and with the true poses, each with all seeds."""
     name, exact, facts = found.name, folder / "exact" / found.name, {}
+    budget = ("budget.minutes=null", f"budget.iterations={steps}")
     if not (exact / "transforms.json").exists():
         with_true_poses(found, exact, true, frame_of, similarity)
-    for kind, root, words in (("found", found.parent, ()), ("true", exact.parent, ("data.scale=1",))):
-        runs = [fitted(root, name, folder / "runs" / f"{name}-{kind}-{s}", steps, s, *words) for s in seeds]
-        facts[kind] = {key: [run[key] for run in runs] for key in ("psnr", "ssim", "seconds")}
+    for kind, scene, scale in (("found", found, 2), ("true", exact, 1)):
+        words = (*budget, f"data.scale={scale}")
+        runs = [fitted(scene, folder / "runs" / f"{name}-{kind}-{s}", f"seed={s}", *words) for s in seeds]
+        facts[kind] = {key: [run["all"][key] for run in runs] for key in ("psnr", "ssim")}
+        facts[kind]["seconds"] = [run["seconds"] for run in runs]
     return facts
 
 
@@ -168,9 +170,7 @@ def pictured(folder: Path, scenes: list[str], seed: int, file: str) -> None:
         shutil.copy(folder / "captures" / scene / PICTURE, folder / f"capture-{scene}.png")
     rows = []
     for scene in scenes:
-        runs = [
-            folder / "runs" / f"{scene}-{kind}-{seed}" / "images" / "images" for kind in ("found", "true")
-        ]
+        runs = [folder / f"runs/{scene}-{kind}-{seed}/images/images" for kind in ("found", "true")]
         drawn = sorted(runs[0].iterdir())
         view = drawn[len(drawn) // 2].name
         (truth,) = (folder / "exact" / scene / "images").glob(f"{Path(view).stem}.*")

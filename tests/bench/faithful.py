@@ -53,16 +53,10 @@ TIMED = {"cpu": 1, "cuda": 3}  # steps
 
 def configured(method: str, scene: Path, rays: int | None = None, device: str = "cpu") -> DictConfig:
     """Compose the config of a method with its published numbers, or with so many rays a step."""
-    words = [
-        "experiment=dnerf",
-        f"model={method}",
-        "preset=faithful",
-        "trainer=cpu" if device == "cpu" else "trainer=gpu",
-        "threads=1",
-        "logger=none",
-    ]
-    words += [] if rays is None else [f"preset.rays={rays}"]
-    return composed(*words, f"data.root={scene.parent}", f"data.scene={scene.name}")
+    data = [f"data.root={scene.parent}", f"data.scene={scene.name}"]
+    trainer = "cpu" if device == "cpu" else "gpu"
+    words = ["experiment=dnerf", f"model={method}", "preset=faithful", f"trainer={trainer}", "threads=1"]
+    return composed(*words, "logger=none", *data, *([] if rays is None else [f"preset.rays={rays}"]))
 
 
 def measured(method: str, scene: Path, rays: int | None = None, device: str = "cpu") -> dict:
@@ -131,15 +125,13 @@ def stepped(run: Run, module: DynamicSceneModule, optimizer: torch.optim.Optimiz
 
 def on_gpu(method: str, scene: Path) -> dict:
     """Measure on a GPU, in this process, as its memory is freed between methods."""
-    why = ""
     try:
         return measured(method, scene, device="cuda")
     except (RuntimeError, ValueError) as error:
-        why = str(error).split("\n")[0]
+        return dict.fromkeys(FIELDS) | {"method": method, "failed": str(error).split("\n")[0]}
     finally:
         gc.collect()
         torch.cuda.empty_cache()
-    return dict.fromkeys(FIELDS) | {"method": method, "failed": why}
 
 
 def apart(method: str, scene: Path, gib: float) -> dict:
@@ -191,13 +183,12 @@ def steps_table(rows: Sequence[dict], device: str = "cpu") -> str:
 
 def known_rows(file: Path) -> list[dict]:
     """Read the rows of an earlier call."""
-    return [
-        {
-            name: row[name] if name in ("method", "failed", *CONDITIONS) else json.loads(row[name] or "null")
-            for name in (*FIELDS, *CONDITIONS)
-        }
-        for row in read_rows(file)
-    ]
+    words = ("method", "failed", *CONDITIONS)
+
+    def known(name: str, cell: str):
+        return cell if name in words else json.loads(cell or "null")
+
+    return [{name: known(name, row[name]) for name in (*FIELDS, *CONDITIONS)} for row in read_rows(file)]
 
 
 def table_file(page: Path, device: str) -> Path:

@@ -7,16 +7,16 @@ and 56,000.
 
 from __future__ import annotations
 
-import importlib
 import math
 import statistics
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
+from unittest.mock import patch
 
 import lightning
 import torch
@@ -37,6 +37,7 @@ from forewarp.training.stages import Run
 from tests.bench.workloads import VERDICTS, milliseconds, slope, timed
 from tests.stability.report import implementation, table
 from tests.support.configs import composed
+from tests.support.kernels import kernels_of
 
 COUNT, SIDE, NODES = 12_000, 400, 200
 LEARNED = 2_000  # steps that most particles had learned from by then
@@ -147,10 +148,9 @@ def _made(make: Callable[[Start], Particles], start: Start, size: Size) -> Parti
         method.colors.copy_(particles.colors[:, :1])
         if method.nodes is not None:
             draw = torch.Generator().manual_seed(1)
-            for curves in filter(
-                lambda part: part is not None, (method.nodes.translations, method.nodes.rotations)
-            ):
-                curves.copy_(0.02 * torch.randn(curves.shape, generator=draw))
+            for curves in (method.nodes.translations, method.nodes.rotations):
+                if curves is not None:
+                    curves.copy_(0.02 * torch.randn(curves.shape, generator=draw))
             method.nodes.seen_times.copy_(torch.tensor([0.0, 1.0]))
     return method
 
@@ -209,11 +209,11 @@ class Loop:
 STEPS, FEW = 40, 5  # repetitions: of what takes milliseconds, of what takes long
 # Of which kernels a part consists: the module's name in ``ops.kernels``, and its functions; none named: all.
 PARTS = {
-    "projection": (("project", ()),),
+    "projection": (("project", ("project",)),),
     "sorting into tiles": (("rasterize", ("sort_into_tiles",)),),
     "forward: a picture's": (("rasterize", ("draw",)),),
     "forward, loss and backward": (("rasterize", ("compare",)),),
-    "chain, back to particles and nodes": (("backward", ()),),
+    "chain, back to particles and nodes": (("project", ("splat_gradients", "chain")),),
     "nodes": (("nodes", ("carry", "pull", "spread")),),
     "weights of nodes": (("nodes", ("weigh",)),),
     "optimiser": (("adam", ()),),
@@ -256,7 +256,6 @@ LEAST_SHARE, LEAST_GAIN, STEP_MS, PICTURE_MS = 0.8, 1.6, 7.0, 5.0  # the goals
 def kernels_timed() -> Iterator[dict[tuple[str, str], float]]:
     """Add up the seconds of processor time in each kernel by module and name; all must be compiled before."""
     spent: dict[tuple[str, str], float] = {}
-    before = []
 
     def clocked(key: tuple[str, str], kernel: Callable) -> Callable:
         def call(*arguments):
@@ -268,18 +267,12 @@ def kernels_timed() -> Iterator[dict[tuple[str, str], float]]:
 
         return call
 
-    for part in {part for kernels in PARTS.values() for part, _ in kernels}:
-        home = importlib.import_module(f"forewarp.ops.kernels.{part}")
-        for name, kernel in list(vars(home).items()):
-            own = hasattr(kernel, "py_func") and kernel.py_func.__module__ == home.__name__
-            if own and not name.startswith("_"):
-                before.append((home, name, kernel))
-                setattr(home, name, clocked((part, name), kernel))
-    try:
+    with ExitStack() as stack:
+        for part in {part for kernels in PARTS.values() for part, _ in kernels}:
+            home, kernels = kernels_of(part)
+            for name, kernel in kernels.items():
+                stack.enter_context(patch.object(home, name, clocked((part, name), kernel)))
         yield spent
-    finally:
-        for home, name, kernel in before:
-            setattr(home, name, kernel)
 
 
 def parts_of(work: Callable[[], object], repeats: int = STEPS) -> dict[str, float]:

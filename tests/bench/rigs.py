@@ -9,7 +9,6 @@ from __future__ import annotations
 import argparse
 import json
 import time
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,10 +19,8 @@ from forewarp.data.images import read_image
 from forewarp.data.posed_video import PosedShot, read_scene, write_scene
 from forewarp.scene.box import Box
 from forewarp.scene.camera import Camera
-from tests.bench.capture import called
+from tests.bench.capture import called, fitted, in_world_of
 from tests.support.captures import Similarity, pose_errors
-
-TRAIN = ["trainer=cpu", "logger=none", "callbacks.pictures=null", "budget.clock=processor", "threads=1"]
 
 
 def truth_of(films: Path) -> tuple[dict[str, Camera], dict[str, float], dict]:
@@ -87,30 +84,14 @@ def with_true_poses(films: Path, folder: Path, to: Path, similarity: Similarity,
         image = Path(entry["file_path"]).name
         pixels = read_image(folder / (f"images_{scale}" if scale > 1 else "images") / image)[..., :3]
         camera = cameras[entry["camera"]].resized(pixels.shape[1], pixels.shape[0])
-        pose = torch.eye(4, dtype=torch.float64)
-        pose[:3, :3] = torch.from_numpy(similarity.turn.T) @ camera.camera_to_world[:3, :3]
-        place = (np.asarray(camera.center) - similarity.shift) @ similarity.turn / similarity.scale
-        pose[:3, 3] = torch.from_numpy(place)
         moving = read_image(folder / entry["moving_path"])[..., 0].numpy() > 127
         rows, columns = ((np.arange(n) * big // n) for n, big in zip(pixels.shape[:2], moving.shape))
         time_of = (seconds[entry["file_path"]] - first) / (last - first)
         rig = {"taken_by": entry["camera"], "moment": entry["moment"]}
-        shot = PosedShot(image, replace(camera, camera_to_world=pose), pixels, time_of, **rig)
+        shot = PosedShot(image, in_world_of(similarity, camera), pixels, time_of, **rig)
         shots.append(replace(shot, moving=moving[rows][:, columns]))
     limits = {key: content[key] for key in ("near", "far", "seconds")} | {"aabb": Box(*content["aabb"])}
     write_scene(to, shots, **limits, points=np.load(folder / "points.npy"))
-
-
-def fit(scene: Path, run: Path, held: str, words: Sequence[str]) -> dict:
-    """Fit a scene without one camera, unless a run of that name has finished; return its scores."""
-    if not (run / "seconds.json").exists():
-        options = [f"data.root={scene.parent}", f"data.scene={scene.name}", f"run={run}", *TRAIN]
-        spent = called(
-            "train", "experiment=video_with_poses", f"data.test_cameras=[{held}]", *options, *words
-        )
-        (run / "seconds.json").write_text(json.dumps(spent))
-    scores = json.loads((run / "metrics.json").read_text())["test"]
-    return {**scores, "seconds": json.loads((run / "seconds.json").read_text())}
 
 
 def main() -> None:
@@ -134,10 +115,10 @@ def main() -> None:
     if words.minutes:
         if not (exact / "transforms.json").exists():
             with_true_poses(words.films, found, exact, similarity, words.scale)
-        minutes = f"budget.minutes={words.minutes}"
-        runs = words.out / "runs"
-        facts["found"] = fit(found, runs / "found", words.held, [minutes, f"data.scale={words.scale}"])
-        facts["true"] = fit(exact, runs / "true", words.held, [minutes, "data.scale=1"])
+        budget = f"budget.minutes={words.minutes}", "budget.clock=processor"
+        for kind, scene, scale in (("found", found, words.scale), ("true", exact, 1)):
+            options = *budget, f"data.test_cameras=[{words.held}]", f"data.scale={scale}"
+            facts[kind] = fitted(scene, words.out / "runs" / kind, *options)
     (words.out / "facts.json").write_text(json.dumps(facts, indent=2) + "\n")
     print(json.dumps(facts, indent=2))
 

@@ -96,10 +96,8 @@ def page_table(viewer: Viewer) -> str:
 def measured(viewer: Viewer, browser, address: str) -> list[list[str]]:
     """The lines of ``page_table``."""
     tab, frames = Tab(browser, None), []
-    tab.page.on(
-        "websocket",
-        lambda s: s.on("framereceived", lambda data: frames.append((len(data), time.perf_counter()))),
-    )
+    received = lambda data: frames.append((len(data), time.perf_counter()))  # noqa: E731
+    tab.page.on("websocket", lambda socket: socket.on("framereceived", received))
     tab.open(address)
     tab.settled()
     session = viewer.pages[0].session

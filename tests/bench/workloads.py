@@ -177,9 +177,8 @@ def make_module(
 ) -> tuple[DynamicSceneModule, Batch]:
     """Make the paper's fine stage (U-Net of 16 channels, doubled resolution, two renderings), and a batch."""
     method = make_method(side, dense, effects=effects, shift=shift)
-    method.renderer = Renderer(
-        color_threshold=0.0 if dense else threshold, early_stop_eps=0.0 if dense else 1e-4
-    )
+    color, early = (0.0, 0.0) if dense else (threshold, 1e-4)
+    method.renderer = Renderer(color_threshold=color, early_stop_eps=early)
     return module_of(method, WEIGHTS, side), batch_of(rays)
 
 
@@ -280,11 +279,8 @@ def render_work(rays: float, dense: bool, step: float = 0.5) -> Work:
     method = make_method(128, dense, effects=("view_dependence",))
     grid, view = method.radiance(), some_pixels(int(rays)).rays()
     values = grid.values.detach().requires_grad_()
-    renderer = Renderer(step=step, color_threshold=0.0 if dense else 1e-4)
-    shaded = method.view_dependence
-    return backwards(
-        dense, lambda: renderer(grid.with_values(values), view, WHITE, shaded).rgb.square().mean()
-    )
+    draw, shaded = Renderer(step=step, color_threshold=0.0 if dense else 1e-4), method.view_dependence
+    return backwards(dense, lambda: draw(grid.with_values(values), view, WHITE, shaded).rgb.square().mean())
 
 
 def step_work(side: float, dense: bool, rays: int = 2048) -> Work:
@@ -334,41 +330,30 @@ def frame_work(size: float, dense: bool, first: bool = True, side: int = 64, pla
 
 
 SIDES = (32, 48, 64, 80)
-CUBE = {"work": lambda side: side**3}
+RAYS, PIXELS, PICTURE = (1024, 2048, 4096, 8192), (50, 100, 200, 400), "side of the picture"
+CUBE, SQUARE = {"work": lambda side: side**3}, {"work": lambda n: n**2}
 CASES = {
     "splat": Case("side of the lattice", SIDES, splat_work, dense_sizes=SIDES, **CUBE),
     "fields": Case("side of the lattice", SIDES, fields_work, dense_sizes=(32, 48), **CUBE),
     "inpaint": Case("side of the lattice", SIDES, inpaint_work, dense_sizes=(32, 48), **CUBE),
-    "render by rays": Case("rays", (1024, 2048, 4096, 8192), render_work, dense_sizes=(1024, 2048)),
+    "render by rays": Case("rays", RAYS, render_work, dense_sizes=(1024, 2048)),
     "render by samples": Case(
-        "steps a voxel",
-        (1, 2, 4, 8),
-        lambda per, dense: render_work(2048, dense, step=1 / per),
-        dense_sizes=(1, 2),
+        "steps a voxel", (1, 2, 4, 8), lambda n, dense: render_work(2048, dense, 1 / n), dense_sizes=(1, 2)
     ),
     "step by lattice": Case("side of the lattice", SIDES, step_work, dense_sizes=(32, 48), **CUBE),
     "step by rays": Case(
-        "rays",
-        (1024, 2048, 4096, 8192),
-        lambda rays, dense: step_work(32, dense, int(rays)),
-        dense_sizes=(1024,),
+        "rays", RAYS, lambda rays, dense: step_work(32, dense, int(rays)), dense_sizes=(1024,)
     ),
-    "frame, first of its time": Case(
-        "side of the picture", (50, 100, 200, 400), frame_work, work=lambda n: n**2, dense_sizes=(50, 100)
-    ),
-    "frame, another of it": Case(
-        "side of the picture", (50, 100, 200, 400), partial(frame_work, first=False), work=lambda n: n**2
-    ),
+    "frame, first of its time": Case(PICTURE, PIXELS, frame_work, dense_sizes=(50, 100), **SQUARE),
+    "frame, another of it": Case(PICTURE, PIXELS, partial(frame_work, first=False), **SQUARE),
 }
 
+PADDED = partial(TrajectoryField, bases=10, padding=0.2)
 # Each effect by itself, for what it costs a step.
 ALONE: Mapping[str, dict] = {
     "view_dependence": {"view_dependence": SphericalHarmonics},
-    "motion": {"motion": Motion, "trajectory": partial(TrajectoryField, bases=10, padding=0.2)},
-    "trajectory features": {
-        "motion": Motion,
-        "trajectory": partial(TrajectoryField, bases=10, padding=0.2, features=12),
-    },
+    "motion": {"motion": Motion, "trajectory": PADDED},
+    "trajectory features": {"motion": Motion, "trajectory": partial(PADDED, features=12)},
     "background": {
         "background": partial(StaticBackground, features=3, alpha_init=1e-2, alpha_threshold=1e-4)
     },

@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import zeros
 
-from forewarp.ops.backend import check_shape, cores, match_threads, numba_installed
+from forewarp.ops.backend import check_shapes, cores, match_threads, numba_installed
 from forewarp.ops.curves import dct_basis
 from forewarp.ops.encode import positional_encoding
 from forewarp.ops.grid import block_sums, index_of, second_variation, trilinear
@@ -78,9 +78,12 @@ REFUSED = {
         (partial(average_splat, zeros(4, 2), zeros(5, 3), SHAPE), r"positions: expected shape \(4, 3\), but"),
         (partial(with_copies, AVERAGE, zeros(4, 2), zeros(4).long()), "cells"),
     ],
-    "check_shape": [
-        (partial(check_shape, "points", zeros(4, 3), s), r"points: expected shape \(.*\), but got \(4, 3\)")
-        for s in (("P", 2), (5, 3), ("P",), ("A", "B", "C"))
+    "check_shapes": [
+        (
+            partial(check_shapes, f"points ({s})", zeros(4, 3)),
+            r"points: expected shape \(.*\), but got \(4, 3\)",
+        )
+        for s in ("P, 2", "5, 3", "P", "A, B, C", "..., 4")
     ],
 }
 

@@ -52,16 +52,14 @@ def seen_crowd(kind, count=60, lens=None, **changes):
 def test_project_hand_worked(backend):
     # 4 units away a unit is 10 pixels, a deviation of 0.2 two pixels, its variance 4 + 0.1.
     splats = seen(one((0.1, -0.2, 0.0), scale=0.2, opacity=math.log(3), color=(0.1, 0.2, -0.6)))
-    x, y, a, b, c, *_ = splats.values[0].tolist()
+    x, y, a, b, c, *rest = splats.values[0].tolist()
     # Beside the axis the Jacobian's column of depth adds a little to the variance.
     wide, high = 4.1 + (2 * 0.1 / 4) ** 2, 4.1 + (2 * 0.2 / 4) ** 2
     beside = -(2 * 0.1 / 4) * (2 * 0.2 / 4)
     determinant = wide * high - beside**2
     assert (x, y) == pytest.approx((9.0, 6.0))
     assert (a, b, c) == pytest.approx((high / determinant, -beside / determinant, wide / determinant))
-    assert splats.opacity.item() == pytest.approx(0.75)
-    assert splats.rgb[0].tolist() == pytest.approx([0.6, 0.7, 0.0], abs=1e-6)  # never below 0
-    assert splats.depth.item() == pytest.approx(math.sqrt(16.05))
+    assert rest == pytest.approx([0.75, 0.6, 0.7, 0.0, math.sqrt(16.05)], abs=1e-6)  # no colour is below 0
     assert splats.reach[0, 0].item() == pytest.approx(math.sqrt(2 * math.log(255 * 0.75) * wide), rel=1e-5)
 
 
@@ -135,8 +133,8 @@ def test_extreme_particles_are_finite(backend, scale, opacity, quaternion):
 def test_time_changes_colour_and_opacity(backend):
     particles = one()._replace(opacity=torch.tensor([[0.5, 2.0]]), colors=torch.ones(1, 2, 3))
     splats = project(particles, still(particles), straight(), torch.tensor([0.1]), torch.tensor([1.0, -0.5]))
-    assert splats.opacity.item() == pytest.approx(1 / (1 + math.exp(0.5)))
-    assert splats.rgb[0, 0].item() == pytest.approx(0.5 + 0.28209479 + 0.1)
+    assert splats.values[0, COLUMN.opacity].item() == pytest.approx(1 / (1 + math.exp(0.5)))
+    assert splats.values[0, COLUMN.red].item() == pytest.approx(0.5 + 0.28209479 + 0.1)
 
 
 def test_harmonics_are_orthonormal():
@@ -300,7 +298,7 @@ def test_rasterize_by_the_kernel_equals_the_reference(size):
 
 def dense(splats, width, height):
     """The reference without tiles: a number for each splat and pixel."""
-    values = splats.values[splats.depth.detach().sort(stable=True).indices]
+    values = splats.values[splats.values.detach()[:, COLUMN.depth].sort(stable=True).indices]
     x, y, a, b, c, solid = values[:, : COLUMN.red, None, None].unbind(1)
     dx = torch.arange(width) + 0.5 - x
     dy = (torch.arange(height) + 0.5)[:, None] - y
@@ -337,7 +335,7 @@ def test_where_nothing_is_all_is_let_through(backend, splats):
 
 def test_weights_and_what_is_let_through_are_one(backend):
     splats = crowd_of(F32)
-    splats.rgb.fill_(1)
+    splats.values[:, COLUMN.red : COLUMN.depth].fill_(1)
     planes, _ = drawn(splats)
     torch.testing.assert_close(planes[0] + planes[4], torch.ones(SIZE[1], SIZE[0]))
 
@@ -386,6 +384,11 @@ def sensed(kind=F64, seed=3):
     return torch.stack([torch.where(hole < 0.3, 0.0, 3 + 2 * depth), trust]).to(kind)
 
 
+def edges(image, truth):
+    """A loss of neighbouring pixels."""
+    return (image.diff(dim=1) - truth.diff(dim=1)).square().sum()
+
+
 VALID = torch.arange(SIZE[0] * SIZE[1]) % 3 > 0
 
 
@@ -397,6 +400,7 @@ VALID = torch.arange(SIZE[0] * SIZE[1]) % 3 > 0
         {"valid": VALID},
         {"sensed": sensed(), "by_depth": 2.5, "deep": 0.2},
         {"sensed": sensed(), "valid": VALID, "factor": 0.01},
+        {"loss": edges},
     ],
 )
 def test_compare_by_the_kernel_equals_the_reference(options):
@@ -445,9 +449,8 @@ def test_depth_pulls_along_the_ray_and_says_nothing_of_opacity(backend):
     assert abs(right.particles.opacity.item()) < 1e-3 * wrong.particles.opacity.item()
     assert none.depth == 0
     assert doubted.depth == pytest.approx(wrong.depth / 4, rel=1e-5)
-    assert doubted.particles.means[0, 2].item() == pytest.approx(
-        wrong.particles.means[0, 2].item() / 4, rel=1e-3
-    )
+    pulled = wrong.particles.means[0, 2].item() / 4
+    assert doubted.particles.means[0, 2].item() == pytest.approx(pulled, rel=1e-3)
 
 
 def test_a_perfect_image_has_no_loss_and_no_gradient(backend):
@@ -460,9 +463,8 @@ def test_images_pull_at_what_is_seen_and_backgrounds_say_where_nothing_is(backen
     opaque, empty = alone(one(), (255, 255, 255, 255), 0.0), alone(one(), (0, 0, 0, 0), 1.0)
     assert opaque.particles.opacity.item() < 0  # more of it would be nearer to white
     assert bool((opaque.particles.colors[0, 0] < 0).all())
-    assert (
-        opaque.pixel_gradient.item() < 1e-3 * abs(opaque.particles.opacity.item()) + 1
-    )  # it stands in the middle
+    most = 1e-3 * abs(opaque.particles.opacity.item()) + 1  # it stands in the middle
+    assert opaque.pixel_gradient.item() < most
     assert empty.particles.opacity.item() > 0  # less of it
 
 
@@ -543,14 +545,3 @@ def test_the_fused_loss_is_that_of_a_callable(kind):
     close_in_norm(gradients_of(fused), gradients_of(called), 2e-5)
     assert called.order.tolist() == fused.order.tolist()
     assert torch.equal(called.distances[called.order], fused.distances[fused.order])
-
-
-def test_gradients_of_a_loss_of_neighbouring_pixels():
-    """By the kernels, against the reference in float64."""
-
-    def edges(image, truth):
-        return (image.diff(dim=1) - truth.diff(dim=1)).square().sum()
-
-    exact, fast = (run(kind, loss=edges) for kind in (F64, F32))
-    assert fast.loss == pytest.approx(exact.loss, rel=1e-5)
-    close_in_norm(gradients_of(exact), gradients_of(fast), 2e-5)

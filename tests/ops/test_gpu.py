@@ -115,29 +115,30 @@ def of_image():
     return *of_crowd(), pixels, numbers(3)
 
 
+CELLS = torch.tensor([[0, 1, 1], [2, 3, 4], [1, 1, 1]])
+
+
+def of_nodes(*names):
+    """Nodes: their motion, places, neighbours and weights, curves, and gradients."""
+    rotations, maps, bend = numbers(6, 4, 3, seed=1), numbers(6, 12, seed=4), numbers(4, seed=1)
+    parts = {"motion": numbers(6, 6), "places": numbers(6, 3, seed=1), "edges": links(), "basis": numbers(4)}
+    parts |= {"weights": numbers(6, 3, seed=2, low=0.0), "shift": numbers(6, 4, 3), "rotation": rotations}
+    parts |= {"by_maps": maps, "by_motion": numbers(6, 6), "bend": bend}
+    return lambda: tuple(parts[name] for name in names)
+
+
 OPERATORS: dict[str, tuple[Callable, Callable[[], tuple]]] = {
     "trilinear": (
         lambda values, index, where: trilinear(values, index, where, values.new_tensor([-7.0, 0.5])),
         lambda: (*lattice(), points()),
     ),
-    "splat": (
-        splatted,
-        lambda: (
-            numbers(40, 2),
-            points() - 0.3,
-            numbers(3, 2, seed=5),
-            torch.tensor([[0, 1, 1], [2, 3, 4], [1, 1, 1]]),
-        ),
-    ),
+    "splat": (splatted, lambda: (numbers(40, 2), points() - 0.3, numbers(3, 2, seed=5), CELLS)),
     "total_variation": (lambda values, index: total_variation(values, neighbour_pairs(index)), lattice),
     "second_variation": (second_variation, lambda: (numbers(3, 4, 5, 2),)),
     "huber_variation": (huber_variation, lambda: (3 * numbers(3, 4, 5, 2),)),
     "patch_variation": (patch_variation, lambda: (numbers(4, 5, 5), numbers(4, 5, 5, seed=1, low=0.0))),
     "dilate": (lambda index: dilate(index >= 0, 2), lambda: lattice()[1:]),
-    "march": (
-        marched,
-        lambda: (points() - 1.5, numbers(40, 3, seed=2), numbers(40, seed=3, low=0.0)),
-    ),
+    "march": (marched, lambda: (points() - 1.5, numbers(40, 3, seed=2), numbers(40, seed=3, low=0.0))),
     "clip_to_box": (
         lambda o, d: clip_to_box(o, d, 0.1, 9.0, o.new_zeros(3), o.new_tensor([1.0, 2.0, 3.0])),
         lambda: (2 * numbers(20, 3), numbers(20, 3, seed=1)),
@@ -147,16 +148,11 @@ OPERATORS: dict[str, tuple[Callable, Callable[[], tuple]]] = {
         lambda: (numbers(5, low=0.0), numbers(5, low=2.0, high=3.0)),
     ),
     "by_importance": (
-        lambda edges, weights: by_importance(
-            edges.sort(1).values, weights, 9, torch.Generator().manual_seed(0)
-        ),
+        lambda edges, w: by_importance(edges.sort(1).values, w, 9, torch.Generator().manual_seed(0)),
         lambda: (numbers(5, 8), numbers(5, 7, low=0.0)),
     ),
     "render_weights": (lambda x, ray: render_weights(x, ray, 12), lambda: (numbers(30, low=0.0), ids())),
-    "accumulate": (
-        lambda weights, values, ray: accumulate(weights, values, ray, 12),
-        lambda: (numbers(30), numbers(30, 4, seed=1), ids()),
-    ),
+    "accumulate": (lambda *of: accumulate(*of, 12), lambda: (numbers(30), numbers(30, 4, seed=1), ids())),
     "dense_weights": (dense_weights, lambda: (numbers(6, 8, low=0.0),)),
     "dct_basis": (lambda t: dct_basis(t, 6, frames=12, canonical_time=0.2), lambda: (numbers(7, low=0.0),)),
     "spline_basis": (lambda t: spline_basis(t, 6), lambda: (numbers(7, low=0.0),)),
@@ -164,27 +160,15 @@ OPERATORS: dict[str, tuple[Callable, Callable[[], tuple]]] = {
     "spherical_harmonics_1": (spherical_harmonics_1, lambda: (numbers(9, 3),)),
     "distort": (lambda x: distort(x, *LENS), lambda: (0.4 * numbers(9, 2),)),
     "undistort": (lambda x: undistort(x, *LENS), lambda: (0.4 * numbers(9, 2),)),
-    "carry_nodes": (
-        carry_nodes,
-        lambda: (numbers(6, 4, 3), numbers(6, 4, 3, seed=1), numbers(4, seed=2), numbers(6, 3, seed=3)),
-    ),
-    "stiffness": (
-        stiffness,
-        lambda: (numbers(6, 6), numbers(6, 3, seed=1), links(), numbers(6, 3, seed=2, low=0.0)),
-    ),
+    "carry_nodes": (carry_nodes, of_nodes("shift", "rotation", "basis", "places")),
+    "stiffness": (stiffness, of_nodes("motion", "places", "edges", "weights")),
     "pull_nodes": (
         lambda *tensors: pull_nodes(*tensors, 0.7)[0],
-        lambda: (
-            numbers(6, 6),
-            numbers(6, 3, seed=1),
-            numbers(6, 12, seed=4),
-            links(),
-            numbers(6, 3, seed=2),
-        ),
+        of_nodes("motion", "places", "by_maps", "edges", "weights"),
     ),
     "spread_nodes": (
         lambda *tensors: spread_nodes(*(x.detach() for x in tensors), 0.3, 2.0)[:2],
-        lambda: (numbers(6, 4, 3), numbers(6, 4, 3, seed=1), numbers(6, 6), numbers(4), numbers(4, seed=1)),
+        of_nodes("shift", "rotation", "by_motion", "basis", "bend"),
     ),
     "skin_weights": (skin_weights, lambda: (numbers(9, 4, low=0.0), numbers(9, 4))),
     "move_by_screw": (move_by_screw, lambda: (numbers(9, 3), numbers(9, 3, seed=1), numbers(9, 3, seed=2))),

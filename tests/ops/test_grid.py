@@ -72,9 +72,8 @@ def test_a_second_derivative_is_refused_and_not_silently_zero(sparse):
     pytest.importorskip("numba")
     values, index, fill = sparse
     points = random_points(3, low=0.1, high=1.9).requires_grad_()
-    (gradient,) = torch.autograd.grad(
-        grid.trilinear(values, index, points, fill).square().sum(), points, create_graph=True
-    )
+    squared = grid.trilinear(values, index, points, fill).square().sum()
+    (gradient,) = torch.autograd.grad(squared, points, create_graph=True)
     with pytest.raises(RuntimeError, match="once_differentiable"):
         gradient.sum().backward()
 

@@ -67,9 +67,10 @@ LOW, HIGH = torch.tensor([-1.0, -2, -3]), torch.tensor([1.0, 2, 3])
 )
 def test_clipping_hand_worked(origin, direction, expected):
     begin, end = march.clip_to_box(torch.tensor([origin]), torch.tensor([direction]), 0.0, 10.0, LOW, HIGH)
-    assert (
-        (end <= begin).item() if expected is None else (begin.item(), end.item()) == pytest.approx(expected)
-    )
+    if expected is None:
+        assert end <= begin
+    else:
+        assert (begin.item(), end.item()) == pytest.approx(expected)
 
 
 def run(origins, directions, cells):
@@ -139,9 +140,8 @@ def plainly(origins, directions, jitter, cells, index, raw):
     rays, distances = march.march_reference(origins, directions, 0.2, 40.0, STEP, cells, jitter)
     points = origins[rays] + distances[:, None] * directions[rays]
     read = trilinear_reference(raw[:, None], index, points, raw.new_full((1,), FILL))[:, 0]
-    weights, through = march.render_weights(
-        torch.nn.functional.softplus(read + SHIFT) * SCALE, rays, len(origins)
-    )
+    optical = torch.nn.functional.softplus(read + SHIFT) * SCALE
+    weights, through = march.render_weights(optical, rays, len(origins))
     return rays, distances, weights, through
 
 
@@ -199,9 +199,8 @@ def test_trace_of_nothing():
 def test_weights_equal_the_slow_twin():
     ids = torch.tensor([0, 0, 0, 2, 2, 4])  # rays 1, 3 and 5 have no sample
     optical = 3 * torch.rand(6, generator=seeded(), dtype=F64)
-    for found, expected in zip(
-        march.render_weights(optical, ids, 6), composite(optical, ids, 6), strict=True
-    ):
+    twin = composite(optical, ids, 6)
+    for found, expected in zip(march.render_weights(optical, ids, 6), twin, strict=True):
         torch.testing.assert_close(found, torch.tensor(expected, dtype=F64))
 
 
@@ -232,9 +231,8 @@ def test_dense_equals_packed():
 
 
 def test_a_last_interval_without_end():
-    optical = torch.tensor(
-        [[math.log(2), 1e10], [math.log(2), 0.0], [math.inf, math.inf]], requires_grad=True
-    )
+    half = math.log(2)
+    optical = torch.tensor([[half, 1e10], [half, 0.0], [math.inf, math.inf]], requires_grad=True)
     weights, transmittance = march.dense_weights(optical)
     torch.testing.assert_close(weights, torch.tensor([[0.5, 0.5], [0.5, 0], [1, 0]]))
     torch.testing.assert_close(transmittance, torch.tensor([0.0, 0.5, 0]), atol=1e-30, rtol=0)

@@ -51,9 +51,8 @@ def test_pull_of_the_kernel_equals_autograd():
     motion, places, edges, weights = some(30)
     by_maps = torch.randn(30, 12, dtype=F64)
     exact, strain = nodes.pull_nodes(motion, places, by_maps, edges, weights, 0.7)
-    fast, same = nodes.pull_nodes(
-        motion.float(), places.float(), by_maps.float(), edges, weights.float(), 0.7
-    )
+    singles = (motion.float(), places.float(), by_maps.float(), edges, weights.float())
+    fast, same = nodes.pull_nodes(*singles, 0.7)
     torch.testing.assert_close(fast.double(), exact, rtol=1e-4, atol=1e-4)
     assert same == pytest.approx(strain, rel=1e-5)
 
@@ -80,16 +79,14 @@ def test_spread_over_curves_equals_autograd(backend, rotates):
     shift, rotation = (torch.randn(5, 7, 3, requires_grad=True) for _ in range(2))
     by_motion, basis, bend = torch.randn(5, 6), torch.rand(7), torch.randn(7)
     loss = value = 0.0
-    for curve, own, unit in ((shift, by_motion[:, :3], 2.0), (rotation, by_motion[:, 3:], 1.0))[
-        : 1 + rotates
-    ]:
+    both = (shift, by_motion[:, :3], 2.0), (rotation, by_motion[:, 3:], 1.0)
+    for curve, own, unit in both[: 1 + rotates]:
         squared = (torch.einsum("mkc,k->mc", curve, bend) / unit).square().mean()
         loss = loss + (torch.einsum("mkc,k->mc", curve, basis) * own).sum() + 3.0 * squared
         value += float(squared.detach())
     loss.backward()
-    first, second, bent = nodes.spread_nodes(
-        shift, rotation if rotates else None, by_motion, basis, bend, 3.0, 2.0
-    )
+    rotation = rotation if rotates else None
+    first, second, bent = nodes.spread_nodes(shift, rotation, by_motion, basis, bend, 3.0, 2.0)
     assert bent == pytest.approx(value, rel=1e-5)
     torch.testing.assert_close(first, shift.grad)
     assert second is None if not rotates else torch.allclose(second, rotation.grad, atol=1e-5)

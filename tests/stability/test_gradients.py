@@ -24,7 +24,7 @@ pytestmark = pytest.mark.stability
 LENS = ((0.1, -0.05, 0.01), (0.01, -0.02))
 # Why operators have no gradient, and which.
 WITHOUT = {
-    "a guard or a switch": "check_shape numba_installed use_numba match_threads warm_up"
+    "a guard or a switch": "check_shapes numba_installed use_numba match_threads warm_up"
     " has_kernels cores compile_backward_kernels is_number check_value",
     "places samples, which no loss pulls at": "march march_reference stratified by_importance clip_to_box",
     "whole numbers, or yes and no": "unfolded index_of dilate occupied_cells neighbour_pairs encoded_size",

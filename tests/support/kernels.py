@@ -5,6 +5,13 @@ import importlib
 import pytest
 
 
+def kernels_of(part):
+    """Return the module ``forewarp.ops.kernels.<part>`` and its public kernels by name."""
+    home = importlib.import_module(f"forewarp.ops.kernels.{part}")
+    own = {name: k for name, k in vars(home).items() if hasattr(k, "py_func") and not name.startswith("_")}
+    return home, {name: k for name, k in own.items() if k.py_func.__module__ == home.__name__}
+
+
 def watch(monkeypatch, *parts):
     """Return a set that takes each call of a public kernel of ``forewarp.ops.kernels.<part>``."""
     numba = pytest.importorskip("numba")
@@ -19,9 +26,7 @@ def watch(monkeypatch, *parts):
         return call
 
     for part in parts:
-        home = importlib.import_module(f"forewarp.ops.kernels.{part}")
-        for name, kernel in list(vars(home).items()):
-            own = hasattr(kernel, "py_func") and kernel.py_func.__module__ == home.__name__
-            if own and not name.startswith("_"):
-                monkeypatch.setattr(home, name, watched(name, kernel))
+        home, kernels = kernels_of(part)
+        for name, kernel in kernels.items():
+            monkeypatch.setattr(home, name, watched(name, kernel))
     return met

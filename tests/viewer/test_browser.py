@@ -17,8 +17,7 @@ pytest.importorskip("viser", reason="no viser: pip install forewarp[viewer]")
 
 from forewarp.cli.view import renderer_of
 from forewarp.runs.config import saved_config
-from forewarp.viewer.begin import vertical_fov
-from forewarp.viewer.rendering import Viewer, ViewState, camera_of
+from forewarp.viewer.rendering import Viewer, ViewState, camera_of, vertical_fov
 from forewarp.viewer.server import serve
 from tests.support.browser import Tab, chromium, until
 from tests.support.commands import call

@@ -5,9 +5,15 @@ import torch
 
 from forewarp.scene.camera import look_at
 from forewarp.scene.view import Moment, View
-from forewarp.viewer.begin import vertical_fov
 from forewarp.viewer.queue import Cancelled
-from forewarp.viewer.rendering import SceneRenderer, Viewer, ViewState, camera_of, turning_axis
+from forewarp.viewer.rendering import (
+    SceneRenderer,
+    Viewer,
+    ViewState,
+    camera_of,
+    turning_axis,
+    vertical_fov,
+)
 from tests.support.particles import EVERY, module_with, shaken, small_data
 from tests.support.tiny_scene import BOX, ball_center, ball_data, ball_scene, camera_at, known_ball
 

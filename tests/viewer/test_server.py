@@ -2,8 +2,10 @@
 
 import contextlib
 import errno
+import math
 import os
 import socket
+import sys
 import threading
 import urllib.request
 from dataclasses import replace
@@ -20,14 +22,14 @@ import viser
 
 from forewarp.scene.cloud import Ellipsoids
 from forewarp.viewer import server as server_module
-from forewarp.viewer.begin import fitted_fov, vertical_fov
-from forewarp.viewer.page import Page
+from forewarp.viewer.page import Page, fitted_fov, splat_arrays
 from forewarp.viewer.queue import Cancelled
-from forewarp.viewer.rendering import SceneRenderer, Viewer, ViewState, first_frame
+from forewarp.viewer.rendering import SceneRenderer, Viewer, ViewState, first_frame, vertical_fov
 from forewarp.viewer.server import check_address
 from forewarp.viewer.session import Session
 from tests.contract.fitting import stage_of
 from tests.contract.table import METHODS
+from tests.support.browser import NEEDED, chromium
 from tests.support.fakes import FakePage
 from tests.support.tiny_scene import ball_data, ball_scene, known_ball, make_run, same, stage
 
@@ -113,6 +115,21 @@ def test_pages_of_foreign_sites_are_sent_nothing(viewer, tmp_path):
                 else:
                     with pytest.raises(ConnectionClosed, match="not a page of this server"):
                         client.recv(timeout=10)
+
+
+@pytest.mark.parametrize(("side", "away"), [(1, 2.0), (-1, 7.0)])
+def test_a_page_begins_where_a_camera_stands_and_turns_about_a_point_ahead(side, away):
+    camera, server = ball_scene().train[0].camera, Mock()
+    pose, up = camera.camera_to_world, torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+    center, ahead = pose[:3, 3], pose[:3, 2]
+    scene = SimpleNamespace(box=SimpleNamespace(diagonal=7.0))
+    viewer = SimpleNamespace(focus=center + side * 2 * ahead + 0.3 * pose[:3, 0], up=up, scene=scene)
+    server_module._begin_at(server, viewer, ViewState(pose, vertical_fov(camera)))
+    seen = server.initial_camera
+    np.testing.assert_allclose(seen.position, center)
+    np.testing.assert_allclose(seen.look_at, center + away * ahead)
+    assert seen.fov == pytest.approx(2 * np.arctan(0.5 * camera.height / camera.fy))
+    server.scene.set_up_direction.assert_called_once_with((0.0, 0.0, 1.0))
 
 
 class Watcher(FakePage):
@@ -286,6 +303,26 @@ def test_controls_offer_what_the_method_of_a_stage_can_show(modules, client, tmp
     assert (page.channel.value, page.trajectories.value) == ("colour", False)
 
 
+@pytest.mark.parametrize(("width", "height"), [(400, 400), (1000, 400), (390, 844)])
+def test_a_canvas_shows_the_whole_image(width, height):
+    camera = ball_scene().train[0].camera
+    down = math.tan(0.5 * fitted_fov(camera, width, height))
+    across = down * width / height
+    assert down >= 0.5 * camera.height / camera.fy - 1e-9
+    assert across >= 0.5 * camera.width / camera.fx - 1e-9
+    assert min(down / (camera.height / camera.fy), across / (camera.width / camera.fx)) == pytest.approx(0.5)
+
+
+def test_splats_keep_their_shape_in_half_precision():
+    places, roots = torch.ones(1, 3), 3e-5 * torch.eye(3)[None]
+    small = Ellipsoids(places, roots, torch.full((1,), 0.5), torch.zeros(1, 1, 3))
+    centers, covariances, colors, opacity = splat_arrays(small, 1e-2)
+    np.testing.assert_allclose(centers, [[100, 100, 100]], rtol=1e-6)
+    sent = covariances[0].astype(np.float16).astype(float)
+    np.testing.assert_allclose(1e-4 * sent, 9e-10 * np.eye(3), rtol=0.01)
+    assert (colors.tolist(), opacity.tolist()) == ([[0.5] * 3], [[0.5]])
+
+
 @pytest.mark.parametrize("shade", [0, 255])
 def test_splats_are_seen_before_the_background_of_exact_images(shade):
     client, renderer = Mock(), SimpleNamespace(background=torch.full((3,), shade / 255))
@@ -316,3 +353,18 @@ def test_why_there_is_no_screenshot_is_told(viewer, channel, error, says):
     page.tell = said.append
     page.save_screenshot()
     assert said == says
+
+
+@pytest.mark.parametrize(
+    ("needed", "outcome"), [("", pytest.skip.Exception), ("1", pytest.fail.Exception)], ids=["skip", "fail"]
+)
+@pytest.mark.parametrize("lacks", ["playwright", "chromium"])
+def test_a_missing_browser_skips_its_tests_or_fails_where_it_is_needed(monkeypatch, lacks, needed, outcome):
+    monkeypatch.setenv(NEEDED, needed)
+    if lacks == "playwright":
+        monkeypatch.setitem(sys.modules, "playwright.sync_api", None)
+    else:
+        pytest.importorskip("playwright.sync_api", reason="no playwright; make install-browser adds it")
+        monkeypatch.setattr("shutil.which", lambda name: "/nowhere/chromium")
+    with pytest.raises(outcome, match=f"no {lacks}.*make install-browser"), chromium():
+        pass

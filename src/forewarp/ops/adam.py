@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from forewarp.ops.backend import check_shape, match_threads, use_numba
+from forewarp.ops.backend import check_shapes, match_threads, use_numba
 
 
 class AdamState(NamedTuple):
@@ -27,6 +27,9 @@ class AdamState(NamedTuple):
     square: Tensor
     steps: Tensor
     lr: float
+
+
+_SHAPES = "value (..., C), gradient (..., C), exp_avg (..., C), exp_avg_sq (..., C), steps (...)"
 
 
 def adam_rows(states: Sequence[AdamState], betas: tuple[float, float], eps: float) -> None:
@@ -47,11 +50,7 @@ def adam_rows(states: Sequence[AdamState], betas: tuple[float, float], eps: floa
     """
     fast = []
     for state in states:
-        shape = tuple(state.value.shape)
-        check_shape("gradient", state.gradient, shape)
-        check_shape("exp_avg", state.mean, shape)
-        check_shape("exp_avg_sq", state.square, shape)
-        check_shape("steps", state.steps, shape[:-1])
+        check_shapes(_SHAPES, *state[:5])
         if _fits_kernel(state):
             fast.append(state)
         else:
@@ -78,9 +77,8 @@ def _adam_numba(states: list[AdamState], betas: tuple[float, float], eps: float)
         width, tensors = value.shape[-1], (value, alive[-1], mean, square, steps)
         table.append([*(t.data_ptr() for t in tensors), value.numel() // width, width])
     rates = np.array([state.lr for state in states], np.float32)
-    first, second = map(float, betas)
-    bias = kernels.biases(first, second)
-    kernels.adam(np.array(table, np.int64), rates, first, second, float(eps), bias)
+    betas = tuple(map(float, betas))
+    kernels.adam(np.array(table, np.int64), rates, *betas, float(eps), kernels.biases(*betas))
 
 
 def _adam_reference(state: AdamState, betas: tuple[float, float], eps: float) -> None:

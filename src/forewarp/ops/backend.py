@@ -9,6 +9,7 @@ from __future__ import annotations
 import importlib.util
 import math
 import os
+import re
 import threading
 from collections.abc import Callable
 from functools import cache
@@ -80,19 +81,28 @@ def check_value(key: str, given: Any, wanted: str, good: Callable[[Any], bool], 
         raise ValueError(f"{key}: expected {wanted}, but got {given!r}" + (f"; {advice}" if advice else ""))
 
 
-def check_shape(name: str, tensor: Tensor, shape: tuple[int | str, ...]) -> None:
-    """Raise ValueError unless ``tensor`` has ``shape``.
+@cache
+def _parsed(shapes: str) -> list[tuple[str, list[int | str]]]:
+    """Return the names and the sizes that ``check_shapes`` is told."""
+    parts = re.findall(r"([\w.]+) \((.*?)\)", shapes)
+    return [(name, [int(s) if s.isdigit() else s for s in sizes.split(", ")]) for name, sizes in parts]
 
-    A letter stands for any size, "..." in front for any number of sizes.
+
+def check_shapes(shapes: str, *tensors: Tensor, **sizes: int) -> None:
+    """Raise ValueError unless tensors have the named ``shapes``, as "points (P, 3), weights (P)".
+
+    A letter stands for any size, or for that in ``sizes``, but for the same one wherever it stands; "..." in
+    front stands for any number of sizes, as the first letter does.
 
     >>> import torch
-    >>> check_shape("points", torch.zeros(4, 3), ("P", 3))
+    >>> check_shapes("points (P, 3), colors (P, C)", torch.zeros(4, 3), torch.zeros(4, 1))
     """
-    if tensor.shape == shape:
-        return
-    sizes = tuple(tensor.shape)
-    last = shape[1:] if shape[:1] == ("...",) else shape
-    ends = sizes[-len(last) :] if last is not shape else sizes
-    if len(ends) != len(last) or not all(isinstance(s, str) or s == n for s, n in zip(last, ends)):
-        wanted = ", ".join(str(s) for s in shape)
-        raise ValueError(f"{name}: expected shape ({wanted}), but got {sizes}")
+    known: dict = dict(sizes)
+    for (name, wanted), tensor in zip(_parsed(shapes), tensors, strict=True):
+        found, expected = tuple(tensor.shape), [known.get(size, size) for size in wanted]
+        if wanted[0] == "...":
+            front = known.setdefault("...", found[: max(0, len(found) - len(wanted) + 1)])
+            expected = [*front, *expected[1:]]
+        if len(found) != len(expected) or any(isinstance(e, int) and e != n for e, n in zip(expected, found)):
+            raise ValueError(f"{name}: expected shape ({', '.join(map(str, expected))}), but got {found}")
+        known |= {size: n for size, n in zip(expected, found) if isinstance(size, str)}

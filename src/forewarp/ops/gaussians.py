@@ -16,13 +16,12 @@ from torch.autograd.function import once_differentiable
 from torch.nn.functional import pad
 from torch.utils.checkpoint import checkpoint
 
-from forewarp.ops.backend import arrays, check_shape, match_threads, use_numba
+from forewarp.ops.backend import arrays, check_shapes, match_threads, use_numba
 from forewarp.ops.lens import distort_with_jacobian
 
 BLUR = 0.1  # square pixels; a pixel alone has a variance of 1/12
-CHUNK = (
-    1 << 22
-)  # pairs of a splat and a pixel that the reference holds: with gradients some 12 tensors of them
+# Pairs of a splat and a pixel that the reference holds: with gradients some 12 tensors of them.
+CHUNK = 1 << 22
 FLAT = 0.28209479177387814  # the first harmonic, 1 / sqrt(4 pi), which no direction changes
 DEEP = 0.03  # relative error of depth at which its loss turns from a square to a line
 LEAST_LOG = -math.log(255.0)  # of an alpha: less than a 255th is not seen
@@ -100,21 +99,6 @@ class Splats(NamedTuple):
     values: Tensor
     reach: Tensor
 
-    @property
-    def opacity(self) -> Tensor:
-        """(N,)."""
-        return self.values[:, COLUMN.opacity]
-
-    @property
-    def rgb(self) -> Tensor:
-        """(N, 3)."""
-        return self.values[:, COLUMN.red : COLUMN.depth]
-
-    @property
-    def depth(self) -> Tensor:
-        """(N,) distances from the camera, world units."""
-        return self.values[:, COLUMN.depth]
-
 
 def project(
     particles: Gaussians, warp: Warp, pinhole: Pinhole, color_basis: Tensor, opacity_basis: Tensor
@@ -145,23 +129,22 @@ def project(
     _check(particles, warp, color_basis, opacity_basis)
     if not use_numba(particles.means) or particles.means.dtype != torch.float32:
         return project_reference(particles, warp, pinhole, color_basis, opacity_basis)
-    return Splats(
-        *_Project.apply(*particles, *warp, pinhole.row(particles.means), color_basis, opacity_basis)
-    )
+    camera = pinhole.row(particles.means)
+    return Splats(*_Project.apply(*particles, *warp, camera, color_basis, opacity_basis))
+
+
+_SHAPES = "means (N, 3), log_scales (N, 3), quaternions (N, 4), opacity (N, F), colors (N, B, 3)"
+_SHAPES += ", maps (M, 12), links (N, L), weights (N, L)"
 
 
 def _check(particles: Gaussians, warp: Warp, color_basis: Tensor, opacity_basis: Tensor) -> None:
-    count, plain = len(particles.means), particles.colors.shape[1] - len(color_basis)
-    for name, shape in zip(Gaussians._fields, ((3,), (3,), (4,), (len(opacity_basis),), ("B", 3))):
-        check_shape(name, getattr(particles, name), (count, *shape))
+    check_shapes(_SHAPES, *particles, *warp, F=len(opacity_basis))
+    plain = particles.colors.shape[1] - len(color_basis)
     if plain not in (1, 4, 9, 16):
         raise ValueError(
             f"colors: expected 1, 4, 9 or 16 coefficients of direction beside {len(color_basis)} of time, "
             f"but got {plain}"
         )
-    check_shape("maps", warp.maps, ("M", 12))
-    check_shape("links", warp.links, (count, "L"))
-    check_shape("weights", warp.weights, tuple(warp.links.shape))
 
 
 def harmonics(directions: Tensor, count: int) -> Tensor:
@@ -258,20 +241,17 @@ def _whole(count: int) -> int:
     return -(-count // 16) * 16
 
 
-def _project_numba(
-    means, log_scales, quaternions, opacity, colors, maps, *others, draw: bool = True
-) -> tuple[tuple, Tensor]:
-    """Return what the kernels of both passes read, where maps have 16 numbers each, and the splats (N up to a
-    whole sixteen, 16) of the kernel; without ``draw`` nothing is computed, and they are 0. ``others``: links,
-    weights, the camera's row and both bases.
+def _projected(*tensors: Tensor) -> tuple[tuple[Tensor, ...], Tensor]:
+    """Return what the kernels of both passes read, and the kernel's splats (N up to a whole sixteen, 16).
+
+    Args:
+        tensors: Gaussians, a warp, whose maps get 16 numbers each, the camera's row and both bases.
     """
     from forewarp.ops.kernels import project as kernels
 
-    maps = pad(maps, (0, 4))
-    inputs = (means, log_scales, quaternions, opacity, colors, maps, *others)
-    splats = (means.new_empty if draw else means.new_zeros)(_whole(len(means)), SPLAT)
-    if draw:
-        kernels.project(*arrays(*inputs, splats))
+    inputs = (*tensors[:5], pad(tensors[5], (0, 4)), *tensors[6:])
+    splats = tensors[0].new_empty(_whole(len(tensors[0])), SPLAT)
+    kernels.project(*arrays(*inputs, splats))
     return inputs, splats
 
 
@@ -279,7 +259,7 @@ class _Project(torch.autograd.Function):
     @staticmethod
     def forward(ctx, *tensors):
         match_threads()
-        inputs, splats = _project_numba(*tensors)
+        inputs, splats = _projected(*tensors)
         ctx.save_for_backward(*inputs, splats)
         splats = splats[: len(tensors[0])]
         reach = splats[:, COLUMN.reach_x : COLUMN.log_opacity]
@@ -307,7 +287,7 @@ def _chain(inputs, splats, seen, by_splat, threads, kinds, *, by_weights=True, s
         tensor of their own; by maps; and by weights, or by the numbers whose softmax they are, if
         ``by_weights``.
     """
-    from forewarp.ops.kernels import backward as kernels
+    from forewarp.ops.kernels import project as kernels
 
     count, starts = len(inputs[0]), accumulate(kinds, initial=0)
     gradients = [torch.empty(t.shape) for t in inputs[:4]]
@@ -355,8 +335,7 @@ def rasterize(splats: Splats, width: int, height: int, chunk: int = CHUNK) -> Im
     Cost: of the kernel, about 60 ns a splat and tile that it touches and 10 ns a splat; of the reference,
     some 50 bytes of memory for each pair of a chunk.
     """
-    check_shape("splats.values", splats.values, ("N", COLUMN.depth + 1))
-    check_shape("splats.reach", splats.reach, (len(splats.values), 2))
+    check_shapes("splats.values (N, 10), splats.reach (N, 2)", *splats)
     if width < 1 or height < 1:
         raise ValueError(f"image: expected at least 1 x 1 pixels, but got {width} x {height}")
     if use_numba(splats.values) and splats.values.dtype == torch.float32:
@@ -391,7 +370,7 @@ def rasterize_reference(splats: Splats, width: int, height: int, chunk: int = CH
 def _rows_of_tiles(splats: Splats, across: int, down: int) -> tuple[Tensor, Tensor]:
     """Return the rows of the splats that each tile touches, from near to far, and where each tile's end."""
     seen = (splats.reach[:, 0] > 0).nonzero()[:, 0]
-    order = seen[splats.depth.detach()[seen].sort(stable=True).indices]
+    order = seen[splats.values.detach()[seen, COLUMN.depth].sort(stable=True).indices]
     middle, reach = splats.values.detach()[order, :2], splats.reach[order]
     most = middle.new_tensor([across, down]) - 1
     low = ((middle - reach) / WIDE).floor().nan_to_num().clamp(min=0)
@@ -511,7 +490,7 @@ def _splat_gradients(splats: Tensor, tiles: _Tiles, sums: Tensor, factor: float)
     """Return the rows of splats that are seen, ``factor`` times the gradients by their columns (V', 16), from
     sums over pixels, and the lengths (N,) of those by the pixel.
     """
-    from forewarp.ops.kernels import backward as kernels
+    from forewarp.ops.kernels import project as kernels
 
     # Rows lie side by side in memory: in the order of depth half of the time would be waiting.
     ranks = np.full(len(splats), -1, np.int32)
@@ -544,25 +523,12 @@ class ImageLoss(NamedTuple):
 
 
 def compare(
-    particles: Gaussians,
-    warp: Warp,
-    pinhole: Pinhole,
-    color_basis: Tensor,
-    opacity_basis: Tensor,
-    pixels: Tensor,
-    background: Tensor,
-    *,
-    width: float = 0.05,
-    factor: float = 1.0,
-    by_skin: bool = False,
-    kinds: Sequence[int] | None = None,
-    loss: Callable[[Tensor, Tensor], Tensor] | None = None,
-    valid: Tensor | None = None,
-    sensed: Tensor | None = None,
-    by_depth: float = 1.0,
-    deep: float = DEEP,
+    particles: Gaussians, warp: Warp, pinhole: Pinhole, color_basis: Tensor, opacity_basis: Tensor,
+    pixels: Tensor, background: Tensor, *, width: float = 0.05, factor: float = 1.0, by_skin: bool = False,
+    kinds: Sequence[int] | None = None, loss: Callable[[Tensor, Tensor], Tensor] | None = None,
+    valid: Tensor | None = None, sensed: Tensor | None = None, by_depth: float = 1.0, deep: float = DEEP,
     chunk: int = CHUNK,
-) -> ImageLoss:
+) -> ImageLoss:  # fmt: skip
     """The loss ``sum sqrt(e^2 + width^2) - width`` over pixels and channels, and its gradients.
 
     ``e`` is the image of ``project`` and ``rasterize`` over ``background`` less the truth over the same:
@@ -599,39 +565,37 @@ def compare(
     of the loss.
     """
     _check(particles, warp, color_basis, opacity_basis)
-    check_shape("pixels", pixels, (pinhole.size[0] * pinhole.size[1], 4))
-    check_shape("background", background, (3,))
+    count = math.prod(pinhole.size)
+    check_shapes("pixels (P, 4), background (3)", pixels, background, P=count)
     if pixels.dtype != torch.uint8 or not width > 0:
         raise ValueError(f"compare: expected uint8 pixels and width > 0, but got {pixels.dtype}, {width=}")
     if kinds is not None and sum(kinds) != particles.colors.shape[1]:
         raise ValueError(
             f"kinds: expected {particles.colors.shape[1]} coefficients in all, but got {tuple(kinds)}"
         )
-    seen = particles, warp, pinhole, color_basis, opacity_basis
-    for name, plane, shape in (("valid", valid, (len(pixels),)), ("sensed", sensed, (2, len(pixels)))):
+    for shape, plane in (("valid (P)", valid), ("sensed (2, P)", sensed)):
         if plane is not None:
-            check_shape(name, plane, shape)
-    given = pixels, background, width, factor, by_skin, kinds
-    beside = valid, sensed, by_depth, deep
-    if loss is None and use_numba(particles.means) and particles.means.dtype == torch.float32:
-        return _compare_numba(*seen, *given, *beside)
-    return compare_reference(seen, *given, loss, *beside, chunk)
+            check_shapes(shape, plane, P=count)
+    if loss is not None or not use_numba(particles.means) or particles.means.dtype != torch.float32:
+        seen, rest = (particles, warp, pinhole, color_basis, opacity_basis), (valid, sensed, by_depth, deep)
+        return compare_reference(seen, pixels, background, width, factor, by_skin, kinds, loss, *rest, chunk)
+    threads, (across, down), camera = match_threads(), pinhole.size, pinhole.row(particles.means)
+    inputs, splats = _projected(*particles, *warp, camera, color_basis, opacity_basis)
+    tiles = _sorted_tiles(splats.numpy(), across, down, threads)
+    image, planes = pixels.contiguous().view(torch.int32).reshape(down, across), None
+    if valid is not None or sensed is not None:
+        planes = splats.new_zeros(3, down, across)
+        planes[0] = 1.0 if valid is None else valid.reshape(down, across)
+        if sensed is not None:
+            inverse, trust = _inverse_and_trust(sensed.to(splats))
+            planes[1:] = torch.stack([inverse, by_depth * trust]).reshape(2, down, across)
+    options = width, factor, by_skin, kinds, planes, deep
+    found = _compare_sorted(inputs, splats, tiles, image, background, *options)
+    return found._replace(depth=found.depth / (by_depth or 1.0))
 
 
 def compare_reference(
-    seen: tuple,
-    pixels,
-    background,
-    width,
-    factor,
-    by_skin,
-    kinds,
-    loss=None,
-    valid=None,
-    sensed=None,
-    by_depth=1.0,
-    deep=DEEP,
-    chunk=CHUNK,
+    seen: tuple, pixels, background, width, factor, by_skin, kinds, loss, valid, sensed, by_depth, deep, chunk
 ) -> ImageLoss:
     """``compare`` in plain PyTorch, on any device and in any precision; a ``loss`` by ``project`` and
     ``rasterize``, which use kernels. ``seen`` are the arguments of ``project``.
@@ -667,8 +631,9 @@ def compare_reference(
     found = [torch.zeros_like(leaf) if leaf.grad is None else leaf.grad for leaf in leaves]
     pixel_gradient = splats.values.grad[:, :2].norm(dim=-1)
     squared = float(error.detach().square().sum())
-    skin = _by_softmax(warp.weights.detach(), found[6]) if by_skin else None
-    seen, away = (splats.reach[:, 0] > 0).nonzero()[:, 0], splats.depth.detach()
+    weights, pulled = warp.weights.detach(), warp.weights.detach() * found[6]
+    skin = pulled - weights * pulled.sum(-1, keepdim=True) if by_skin else None  # which a softmax makes
+    seen, away = (splats.reach[:, 0] > 0).nonzero()[:, 0], splats.values.detach()[:, COLUMN.depth]
     order = seen[away[seen].argsort(stable=True)]
     colors = found[4] if kinds is None else found[4].split(list(kinds), 1)
     gradients = Gaussians(*found[:4], colors)
@@ -683,52 +648,13 @@ def _inverse_and_trust(sensed: Tensor) -> tuple[Tensor, Tensor]:
     return torch.where(known, 1 / distance, 0.0), torch.where(known, trust, 0.0)
 
 
-def _by_softmax(weights: Tensor, by_weights: Tensor) -> Tensor:
-    """From the gradients (N, L) by weights that are a softmax to those by the numbers it is of."""
-    pulled = weights * by_weights
-    return pulled - weights * pulled.sum(-1, keepdim=True)
-
-
-def _compare_numba(
-    particles,
-    warp,
-    pinhole,
-    color_basis,
-    opacity_basis,
-    pixels,
-    background,
-    width,
-    factor,
-    by_skin,
-    kinds,
-    valid,
-    sensed,
-    by_depth,
-    deep,
-) -> ImageLoss:
-    threads, (across, down), camera = match_threads(), pinhole.size, pinhole.row(particles.means)
-    inputs, splats = _project_numba(*particles, *warp, camera, color_basis, opacity_basis)
-    tiles = _sorted_tiles(splats.numpy(), across, down, threads)
-    image, planes = pixels.contiguous().view(torch.int32).reshape(down, across), None
-    if valid is not None or sensed is not None:
-        planes = splats.new_zeros(3, down, across)
-        planes[0] = 1.0 if valid is None else valid.reshape(down, across)
-        if sensed is not None:
-            inverse, trust = _inverse_and_trust(sensed.to(splats))
-            planes[1:] = torch.stack([inverse, by_depth * trust]).reshape(2, down, across)
-    found = _compare_sorted(
-        inputs, splats, tiles, image, background, width, factor, by_skin, kinds, planes, deep
-    )
-    return found._replace(depth=found.depth / (by_depth or 1.0))
-
-
 def compile_backward_kernels(
     particles: Gaussians, warp: Warp, pinhole: Pinhole, color_basis: Tensor, opacity_basis: Tensor
 ) -> None:
     """Compile the backward kernels on empty tiles."""
-    view, (width, height) = pinhole.row(particles.means), pinhole.size
-    inputs, splats = _project_numba(*particles, *warp, view, color_basis, opacity_basis, draw=False)
-    count = math.prod(_tiles(width, height))
+    maps, camera, (width, height) = pad(warp.maps, (0, 4)), pinhole.row(particles.means), pinhole.size
+    inputs = (*particles, maps, warp.links, warp.weights, camera, color_basis, opacity_basis)
+    splats, count = torch.zeros(_whole(len(particles.means)), SPLAT), math.prod(_tiles(width, height))
     none, records = np.zeros(0, np.int32), np.zeros((0, COLUMN.depth + 1), np.float32)
     tiles = _Tiles(none, (records, none, np.zeros(count + 1, np.int64), np.array([0, count])), 0)
     image = torch.zeros(height, width, dtype=torch.int32)
@@ -747,11 +673,9 @@ def _compare_sorted(
     sums = torch.empty(len(kept), len(tiles.order), SPLAT)
     scores = torch.zeros(len(kept), 3, dtype=torch.float64)
     (high, wide), edge = image.shape, (0, -image.shape[1] % SIDE, 0, -image.shape[0] % SIDE)
-    padded = pad(image, edge) if any(edge) else image
-    truth = padded.numpy().view("uint32"), wide, high, *arrays(background.float()), np.float32(width)
-    beside = None
-    if planes is not None:
-        beside = (pad(planes, edge) if any(edge) else planes).contiguous().numpy()
+    image, planes = (part if part is None or not any(edge) else pad(part, edge) for part in (image, planes))
+    truth = image.numpy().view("uint32"), wide, high, *arrays(background.float()), np.float32(width)
+    beside = None if planes is None else planes.numpy()
     kernels.compare(*tiles.lists, *truth, beside, np.float32(deep), *arrays(kept, sums, scores))
     seen, by_splat, pixel_gradient = _splat_gradients(splats, tiles, sums, factor)
     gradients, colors, maps, skin = _chain(

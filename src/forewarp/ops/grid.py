@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from forewarp.ops.backend import arrays, check_shape, match_threads, use_numba
+from forewarp.ops.backend import arrays, check_shapes, match_threads, use_numba
 
 _CORNERS = [(a, b, c) for a in (0, 1) for b in (0, 1) for c in (0, 1)]
 
@@ -55,10 +55,8 @@ def trilinear(values: Tensor, index: Tensor, points: Tensor, fill: Tensor) -> Te
     >>> trilinear(v, i.expand(2, 2, 2).contiguous(), torch.tensor([[0.5, 0.25, 0.75]]), torch.zeros(1))
     tensor([[2.]])
     """
-    check_shape("values", values, ("M", "C"))
-    check_shape("index", index, ("X", "Y", "Z"))
-    check_shape("points", points, ("P", 3))
-    check_shape("fill", fill, (values.shape[1],))
+    shapes = "values (M, C), index (X, Y, Z), points (P, 3), fill (C)"
+    check_shapes(shapes, values, index, points, fill)
     if min(index.shape) < 2:
         raise ValueError(f"trilinear: expected at least 2 voxels an axis, but got {tuple(index.shape)}")
     if use_numba(values):
@@ -111,7 +109,7 @@ class _NumbaTrilinear(torch.autograd.Function):
 
 def index_of(voxels: Tensor, shape: tuple[int, int, int]) -> Tensor:
     """Return the index (X, Y, Z) int32 of distinct voxels (N, 3): their row, -1 elsewhere."""
-    check_shape("voxels", voxels, ("N", 3))
+    check_shapes("voxels (N, 3)", voxels)
     index = torch.full(shape, -1, dtype=torch.int32, device=voxels.device)
     x, y, z = voxels.long().unbind(-1)
     index[x, y, z] = torch.arange(len(voxels), dtype=torch.int32, device=voxels.device)
@@ -208,7 +206,7 @@ def total_variation(values: Tensor, pairs: list[tuple[Tensor, Tensor]]) -> Tenso
 
     Cost: two reads of C channels per pair.
     """
-    check_shape("values", values, ("M", "C"))
+    check_shapes("values (M, C)", values)
     total = values.new_zeros(())
     for first, second in pairs:
         if len(first):
@@ -227,7 +225,7 @@ def second_variation(volume: Tensor) -> Tensor:
 
     Cost: three passes over the volume.
     """
-    check_shape("volume", volume, ("X", "Y", "Z", "C"))
+    check_shapes("volume (X, Y, Z, C)", volume)
     if min(volume.shape[:3]) < 3:
         raise ValueError(
             f"second_variation: expected 3 points an axis or more, but got {tuple(volume.shape)}"
@@ -248,7 +246,7 @@ def huber_variation(volume: Tensor) -> Tensor:
 
     Cost: three passes over the volume.
     """
-    check_shape("volume", volume, ("X", "Y", "Z", "C"))
+    check_shapes("volume (X, Y, Z, C)", volume)
     steps = [volume.diff(dim=axis) for axis in range(3)]
     zero = volume.new_zeros(())
     return sum(torch.nn.functional.smooth_l1_loss(d, zero.expand_as(d), reduction="sum") for d in steps)
@@ -266,7 +264,7 @@ def patch_variation(depth: Tensor, opacity: Tensor) -> Tensor:
         difference; the weight of a pair is its lower opacity. 0 for single pixels. Differentiable in
         ``depth``.
     """
-    check_shape("depth", depth, ("B", "S", "S"))
+    check_shapes("depth (B, S, S)", depth)
     mask = opacity.detach()
     across = (depth[:, :, 1:] - depth[:, :, :-1]).square() * torch.minimum(mask[:, :, 1:], mask[:, :, :-1])
     down = (depth[:, 1:] - depth[:, :-1]).square() * torch.minimum(mask[:, 1:], mask[:, :-1])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from forewarp.ops.backend import check_shape
+from forewarp.ops.backend import check_shapes
 
 Radial = tuple[float, float, float]
 Tangential = tuple[float, float]
@@ -37,7 +37,7 @@ def distort(points: Tensor, radial: Radial, tangential: Tangential) -> Tensor:
     >>> distort(torch.tensor([0.5, 0.0]), (0.4, 0.0, 0.0), (0.0, 0.1))
     tensor([0.6250, 0.0000])
     """
-    check_shape("points", points, ("...", 2))
+    check_shapes("points (..., 2)", points)
     return distort_with_jacobian(points, radial, tangential)[0]
 
 
@@ -79,7 +79,7 @@ def unfolded(points: Tensor, radial: Radial, tangential: Tangential) -> Tensor:
     >>> unfolded(torch.tensor([[1.0, 0.0], [1.2, 0.0]]), (-0.25, 0.0, 0.0), (0.0, 0.0))  # until 2 / sqrt(3)
     tensor([ True, False])
     """
-    check_shape("points", points, ("...", 2))
+    check_shapes("points (..., 2)", points)
     place = points.detach().double()
     regular = torch.ones_like(place[..., 0], dtype=torch.bool)
     for k in range(_CHECKS):
@@ -105,7 +105,7 @@ def undistort(points: Tensor, radial: Radial, tangential: Tangential) -> Tensor:
 
     Cost: a few evaluations of ``distort``; up to 40 if a point has no inverse.
     """
-    check_shape("points", points, ("...", 2))
+    check_shapes("points (..., 2)", points)
     goal = points.detach().double()
     damping = torch.ones_like(goal[..., :1])
     ahead = _is_regular(distort_with_jacobian(goal, radial, tangential)[1])[..., None]

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from forewarp.ops.backend import arrays, check_shape, match_threads, use_numba
+from forewarp.ops.backend import arrays, check_shapes, match_threads, use_numba
 from forewarp.ops.grid import index_of, occupied_cells, trilinear
 from forewarp.ops.splat import average_splat
 
@@ -35,8 +35,7 @@ def stratified(near: Tensor, far: Tensor, count: int, generator: torch.Generator
     >>> stratified(torch.tensor([2.0]), torch.tensor([6.0]), 3)
     tensor([[2., 4., 6.]])
     """
-    check_shape("near", near, ("R",))
-    check_shape("far", far, tuple(near.shape))
+    check_shapes("near (R), far (R)", near, far)
     if count < 2:
         raise ValueError(f"stratified: expected count >= 2, but got {count}")
     steps = torch.linspace(0, 1, count, dtype=near.dtype, device=near.device)
@@ -77,8 +76,7 @@ def by_importance(
     >>> by_importance(torch.tensor([[0.0, 1.0, 3.0]]), torch.tensor([[0.5, 0.5]]), 5)
     tensor([[0.0000, 0.5000, 1.0000, 2.0000, 3.0000]])
     """
-    check_shape("edges", edges, ("R", "E"))
-    check_shape("weights", weights, (len(edges), edges.shape[1] - 1))
+    check_shapes("edges (R, E), weights (R, B)", edges, weights, B=edges.shape[-1] - 1)
     if weights.shape[1] < 1 or count < 1 or not floor > 0:
         raise ValueError(
             f"by_importance: expected a bin, count >= 1 and floor > 0, but got {weights.shape[1]} bins, "
@@ -118,8 +116,7 @@ def clip_to_box(
     Returns:
         near (R,) and far (R,); far <= near for a ray that misses the box.
     """
-    check_shape("origins", origins, ("R", 3))
-    check_shape("directions", directions, tuple(origins.shape))
+    check_shapes("origins (R, 3), directions (R, 3)", origins, directions)
     enter, leave = _crossings(origins, directions, low, high)
     return enter.clamp(near, far), leave.clamp(near, far)
 
@@ -162,13 +159,14 @@ def march(
 
     Cost: one test per step in blocks with occupied cells, one per empty block; memory P.
     """
-    _check_march(origins, directions, near, far, step, jitter)
+    rays = origins, directions, near, far, step, cells, jitter
+    _check_march(*rays)
     if not use_numba(origins):
-        return march_reference(origins, directions, near, far, step, cells, jitter)
+        return march_reference(*rays)
     from forewarp.ops.kernels import voxels as kernels
 
     counts, firsts = torch.zeros(2, len(origins), dtype=torch.int64).unbind()
-    common = (*_march_arrays(origins, directions, near, far, step, cells, jitter), *arrays(counts, firsts))
+    common = (*_march_arrays(*rays), *arrays(counts, firsts))
     kernels.march(*common, *arrays(counts[:0], counts[:0], origins[:0, 0]))
     starts, total = counts.cumsum(0) - counts, int(counts.sum())
     ray_ids, distances = counts.new_empty(total), origins.new_empty(total)
@@ -176,12 +174,8 @@ def march(
     return ray_ids, distances
 
 
-def _check_march(
-    origins: Tensor, directions: Tensor, near: float, far: float, step: float, jitter: Tensor
-) -> None:
-    check_shape("origins", origins, ("R", 3))
-    check_shape("directions", directions, (len(origins), 3))
-    check_shape("jitter", jitter, (len(origins),))
+def _check_march(origins, directions, near, far, step, cells, jitter) -> None:
+    check_shapes("origins (R, 3), directions (R, 3), jitter (R)", origins, directions, jitter)
     if not (step > 0 and math.isfinite(step)) or not 0 <= near < far < math.inf:
         raise ValueError(f"march: expected step > 0 and 0 <= near < far, but got {step=}, {near=}, {far=}")
 
@@ -264,16 +258,16 @@ def trace(
 
     Cost: one read of 8 voxels per sample up to a ray's end, twice for returned samples; memory P.
     """
-    _check_march(origins, directions, near, far, step, jitter)
-    check_shape("raw", raw, ("M",))
-    check_shape("index", index, tuple(n + 1 for n in cells.shape))
+    rays = origins, directions, near, far, step, cells, jitter
+    _check_march(*rays)
+    sizes = {axis: n + 1 for axis, n in zip("XYZ", cells.shape)}
+    check_shapes("raw (M), index (X, Y, Z)", raw, index, **sizes)
     from forewarp.ops.kernels import voxels as kernels
 
     sums = torch.zeros(len(origins), 4, dtype=torch.float64)
     read, counts, firsts = torch.zeros(3, len(origins), dtype=torch.int64).unbind()
-    numbers = map(float, (fill, shift, scale, early_stop_eps, threshold))
-    common = (*_march_arrays(origins, directions, near, far, step, cells, jitter), *arrays(raw, index))
-    common = (*common, *numbers, *arrays(sums, read, counts, firsts))
+    field = (*arrays(raw, index), *map(float, (fill, shift, scale, early_stop_eps, threshold)))
+    common = (*_march_arrays(*rays), *field, *arrays(sums, read, counts, firsts))
     kernels.trace(*common, *arrays(counts[:0], counts[:0], origins[:0, 0], origins[:0, 0]))
     starts, total = counts.cumsum(0) - counts, int(counts.sum())
     ids, distances, weights = counts.new_empty(total), *origins.new_empty(2, total).unbind()
@@ -306,8 +300,7 @@ def render_weights(optical: Tensor, ray_ids: Tensor, rays: int) -> tuple[Tensor,
     >>> w.tolist(), t.round(decimals=6).tolist()
     ([0.0, 1.0], [0.0, 1.0])
     """
-    check_shape("optical", optical, ("P",))
-    check_shape("ray_ids", ray_ids, (len(optical),))
+    check_shapes("optical (P), ray_ids (P)", optical, ray_ids)
     # An optical depth of 80 is opaque in float32; the cap keeps the global sum exact.
     x = optical.double().clamp(max=80.0)
     through = x.cumsum(0) - x
@@ -332,7 +325,7 @@ def accumulate(weights: Tensor, values: Tensor, ray_ids: Tensor, rays: int) -> T
     Returns:
         (R, C), 0 for a ray without samples. Differentiable in both.
     """
-    check_shape("values", values, (len(weights), "C"))
+    check_shapes("weights (P), values (P, C)", weights, values)
     return values.new_zeros(rays, values.shape[1]).index_add(0, ray_ids, weights[:, None] * values)
 
 
@@ -351,7 +344,7 @@ def dense_weights(optical: Tensor) -> tuple[Tensor, Tensor]:
     >>> w.round(decimals=6).tolist(), t.round(decimals=6).tolist()
     ([[0.0, 1.0, 0.0]], [0.0])
     """
-    check_shape("optical", optical, ("R", "S"))
+    check_shapes("optical (R, S)", optical)
     x = optical.clamp(max=80.0)
     # Shift instead of subtracting, which would lose digits behind an opaque sample.
     before = torch.cat([torch.zeros_like(x[:, :1]), x.cumsum(1)], 1)

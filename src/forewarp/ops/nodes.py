@@ -5,10 +5,11 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from forewarp.ops.backend import arrays, check_shape, match_threads, use_numba
+from forewarp.ops.backend import arrays, check_shapes, match_threads, use_numba
 
 LEAST = 1e-20  # the sum of a particle's weights is divided by this at least: that of one at rest is 0
 _WIDEST = 16  # nodes of a particle that the kernel knows
+_EDGES = "motion (M, 6), places (M, 3), edges (M, E), weights (M, E)"
 _SMALL = 0.05  # radian; below, series in the squared angle are exact to single precision
 
 
@@ -34,8 +35,7 @@ def node_maps(motion: Tensor, places: Tensor) -> Tensor:
     >>> node_maps(torch.tensor([[0.0, 0.0, 1.0, 0.0, 0.0, 0.0]]), torch.ones(1, 3))[0, 9:]
     tensor([0., 0., 1.])
     """
-    check_shape("motion", motion, ("M", 6))
-    check_shape("places", places, (len(motion), 3))
+    check_shapes("motion (M, 6), places (M, 3)", motion, places)
     shift, gibbs = motion[:, :3], motion[:, 3:]
     x, y, z = gibbs.unbind(-1)
     zero, square = torch.zeros_like(x), gibbs.square().sum(-1)
@@ -62,9 +62,9 @@ def carry_nodes(
 
     Cost: 6 numbers a node and coefficient that is not 0.
     """
-    check_shape("places", places, ("M", 3))
-    _check_curves(shift, rotation, (len(places), len(basis), 3))
     curves = [shift] if rotation is None else [shift, rotation]
+    shapes = "places (M, 3), basis (K), shift (M, K, 3), rotation (M, K, 3)"
+    check_shapes(shapes, places, basis, shift, curves[-1])
     asks = torch.is_grad_enabled() and any(curve.requires_grad for curve in curves)
     if use_numba(shift) and shift.dtype == torch.float32 and not asks:
         from forewarp.ops.kernels import nodes as kernels
@@ -94,9 +94,8 @@ def stiffness(motion: Tensor, places: Tensor, edges: Tensor, weights: Tensor) ->
 
     Cost: about 40 operations an edge.
     """
+    check_shapes(_EDGES, motion, places, edges, weights)
     linear = node_maps(motion, places)[:, :9].reshape(-1, 3, 3)
-    check_shape("edges", edges, (len(motion), "E"))
-    check_shape("weights", weights, tuple(edges.shape))
     apart = places[edges] - places[:, None]
     strain = motion[edges, :3] - motion[:, None, :3] - (linear[:, None] @ apart[..., None])[..., 0]
     return (weights[..., None] * strain.square()).sum()
@@ -120,11 +119,7 @@ def pull_nodes(
 
     Cost: about 60 operations an edge.
     """
-    check_shape("motion", motion, ("M", 6))
-    check_shape("places", places, (len(motion), 3))
-    check_shape("by_maps", by_maps, (len(motion), 12))
-    check_shape("edges", edges, (len(motion), "E"))
-    check_shape("weights", weights, tuple(edges.shape))
+    check_shapes(f"{_EDGES}, by_maps (M, 12)", motion, places, edges, weights, by_maps)
     if use_numba(motion) and motion.dtype == torch.float32:
         from forewarp.ops.kernels import nodes as kernels
 
@@ -162,10 +157,8 @@ def spread_nodes(
 
     Cost: about 20 operations a coefficient.
     """
-    _check_curves(shift, rotation, ("M", "K", 3))
-    check_shape("by_motion", by_motion, (len(shift), 6))
-    check_shape("basis", basis, (shift.shape[1],))
-    check_shape("bend", bend, (shift.shape[1],))
+    shapes = "shift (M, K, 3), rotation (M, K, 3), by_motion (M, 6), basis (K), bend (K)"
+    check_shapes(shapes, shift, shift if rotation is None else rotation, by_motion, basis, bend)
     gradients, total = [], 0.0
     for curve, by_curve, scale in ((shift, by_motion[:, :3], unit), (rotation, by_motion[:, 3:], 1.0)):
         if curve is None:
@@ -188,12 +181,6 @@ def spread_nodes(
     return *gradients, total
 
 
-def _check_curves(shift: Tensor, rotation: Tensor | None, shape: tuple[int | str, ...]) -> None:
-    check_shape("shift", shift, shape)
-    if rotation is not None:
-        check_shape("rotation", rotation, tuple(shift.shape))
-
-
 def skin_weights(shares: Tensor, learned: Tensor) -> Tensor:
     """Return the weights ``s_j exp(l_j) / sum_k s_k exp(l_k)`` of the nodes that particles follow.
 
@@ -212,8 +199,7 @@ def skin_weights(shares: Tensor, learned: Tensor) -> Tensor:
     >>> skin_weights(torch.tensor([[0.5, 0.5]]), torch.tensor([[1000.0, 1000.0]]))
     tensor([[0.5000, 0.5000]])
     """
-    check_shape("shares", shares, ("N", "L"))
-    check_shape("learned", learned, tuple(shares.shape))
+    check_shapes("shares (N, L), learned (N, L)", shares, learned)
     asks = torch.is_grad_enabled() and learned.requires_grad
     fast = use_numba(learned) and learned.dtype == torch.float32 and shares.dtype == torch.float32
     if not fast or asks or not 0 < shares.shape[1] <= _WIDEST:
@@ -247,9 +233,7 @@ def move_by_screw(points: Tensor, rotation: Tensor, shift: Tensor) -> Tensor:
     >>> move_by_screw(torch.tensor([1.0, 0.0, 0.0]), torch.zeros(3), torch.tensor([0.0, 2.0, 0.0]))
     tensor([1., 2., 0.])
     """
-    check_shape("points", points, (*points.shape[:-1], 3))
-    check_shape("rotation", rotation, tuple(points.shape))
-    check_shape("shift", shift, tuple(points.shape))
+    check_shapes("points (..., 3), rotation (..., 3), shift (..., 3)", points, rotation, shift)
     a, b, c = _coefficients(rotation.square().sum(-1, keepdim=True))
     about = torch.linalg.cross(rotation, points)
     along = torch.linalg.cross(rotation, shift)
@@ -286,7 +270,7 @@ def stretch(jacobian: Tensor, floor: float = 1e-6) -> Tensor:
     >>> float(stretch(2 * torch.eye(3)) / torch.tensor(2.0).log() ** 2)
     3.0
     """
-    check_shape("jacobian", jacobian, (*jacobian.shape[:-2], 3, 3))
+    check_shapes("jacobian (..., 3, 3)", jacobian)
     return torch.linalg.svdvals(jacobian).clamp(min=floor).log().square().sum(-1)
 
 

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from forewarp.ops.backend import arrays, check_shape, match_threads, use_numba
+from forewarp.ops.backend import arrays, check_shapes, match_threads, use_numba
 from forewarp.ops.grid import _CORNERS
 
 
@@ -46,8 +46,7 @@ def average_splat(source: Tensor, positions: Tensor, shape: tuple[int, int, int]
 
     Cost: 8 voxels of C + 1 channels per source voxel; memory M (C + 1) for M touched voxels.
     """
-    check_shape("source", source, ("N", "C"))
-    check_shape("positions", positions, (len(source), 3))
+    check_shapes("source (N, C), positions (N, 3)", source, positions)
     last = torch.tensor(shape, device=positions.device) - 1
     detached = positions.detach()
     reaches = ((detached > -1) & (detached < last + 1)).all(-1)  # False for NaN
@@ -76,8 +75,7 @@ def with_copies(splat: Splat, source: Tensor, cells: Tensor, tau: float = 1e-2) 
     >>> with_copies(nothing, torch.tensor([[7.0]]), torch.tensor([[0, 1, 1]])).values
     tensor([[7.]])
     """
-    check_shape("source", source, ("N", "C"))
-    check_shape("cells", cells, (len(source), 3))
+    check_shapes("source (N, C), cells (N, 3)", source, cells)
     index, rows = splat.index.clone(), splat.index[cells.unbind(-1)].long()
     absent = (rows < 0).nonzero()[:, 0]
     fresh = torch.arange(len(absent), device=rows.device) + len(splat.coverage)

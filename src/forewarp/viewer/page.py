@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections.abc import Callable
@@ -18,9 +19,8 @@ from forewarp.evaluation.layers import LAYERS
 from forewarp.scene.camera import Camera
 from forewarp.scene.cloud import Ellipsoids
 from forewarp.scene.frame import spread
-from forewarp.viewer.begin import fitted_fov, splat_arrays, vertical_fov
 from forewarp.viewer.queue import Cancelled
-from forewarp.viewer.rendering import SPLATS, Viewer, first_frame, turning_axis
+from forewarp.viewer.rendering import SPLATS, Viewer, first_frame, turning_axis, vertical_fov
 from forewarp.viewer.session import MAX_VIDEO_SECONDS, MIN_VIDEO_SECONDS, Session
 
 _MOVED = 1e-3  # of the distance to the pivot: a camera that went farther has left the training view
@@ -336,6 +336,24 @@ class Page:
             return
         tell(f"written: {file}")
         self.client.send_file_download(file.name, file.read_bytes(), save_immediately=True)
+
+
+def fitted_fov(camera: Camera, width: float, height: float) -> float:
+    """Return the angle from top to bottom, radians, by which a canvas shows a camera's whole image.
+
+    A canvas narrower than the image, as a phone's, shows more above and below it.
+    """
+    across = 0.5 * camera.width / camera.fx
+    return 2 * math.atan(max(0.5 * camera.height / camera.fy, across * height / width))
+
+
+def splat_arrays(cloud: Ellipsoids, unit: float) -> list[np.ndarray]:
+    """Return what viser's ``add_gaussian_splats(..., scale=unit)`` takes: centers, covariances, colours,
+    opacity. In half precision, which it sends, squares of small lengths vanish: ``unit`` is to be about a
+    hundredth of the scene, world units.
+    """
+    parts = cloud.centers / unit, cloud.covariances / unit**2, cloud.colors, cloud.opacity[:, None]
+    return [part.cpu().numpy() for part in parts]
 
 
 def reason(error: Exception) -> str:

@@ -20,7 +20,6 @@ from forewarp.scene.camera import Camera, focus_point, mean_up
 from forewarp.scene.frame import Frame, Scene
 from forewarp.scene.view import Moment, Rendering, View
 from forewarp.training.module import DynamicSceneModule
-from forewarp.viewer.begin import vertical_fov
 from forewarp.viewer.queue import Cancelled, RenderQueue
 
 SPLATS = "splats"  # drawn by the browser; all other channels are images that the method renders
@@ -45,7 +44,7 @@ class ViewState:
         fov: vertical, radians.
         time: in [0, 1].
         channel: one of ``SceneRenderer.channels``.
-        layer: one of ``SceneRenderer.layers``; a training view is always compared as a whole.
+        layer: one of ``Viewer.layers``; a training view is always compared as a whole.
         trajectories: draw trajectories of points all over the moving surface.
         followed: points, each with the time at which it is there, whose trajectories are drawn.
         training_view: the training view that is compared with its image; None: none.
@@ -70,6 +69,11 @@ class ViewState:
         """Stand where the first test image was taken, at its time; without one, the first training image."""
         frame = first_frame(scene)
         return cls(frame.camera.camera_to_world, vertical_fov(frame.camera), frame.time)
+
+
+def vertical_fov(camera: Camera) -> float:
+    """Return the angle that a camera's image spans from top to bottom, radians."""
+    return 2 * math.atan(0.5 * camera.height / camera.fy)
 
 
 def first_frame(scene: Scene) -> Frame:
@@ -138,18 +142,12 @@ class SceneRenderer:
         splats = (SPLATS,) if isinstance(self.module.method, HasEllipsoids) else ()
         return ("colour", "depth", "opacity", *motion, *splats)
 
-    @property
-    def layers(self) -> tuple[str, ...]:
-        """Which parts of the scene can be shown alone, beside all of it."""
-        return LAYERS if isinstance(self.module.method, HasLayers) else LAYERS[:1]
-
     def method_of(self, layer: str) -> Method:
         """Return the method, or the part of it that is a layer; there may be nothing in that."""
         if layer == LAYERS[0]:
             return self.module.method
         if layer not in self._layers:
-            part = layer_of(self.module.method, layer, self.scene.train, may_be_empty=True)
-            self._layers[layer] = part
+            self._layers[layer] = layer_of(self.module.method, layer, self.scene.train, may_be_empty=True)
         return self._layers[layer]
 
     def invalidate(self) -> None:
@@ -232,9 +230,7 @@ class SceneRenderer:
         return [image.cpu() for image in images]
 
     @torch.no_grad()
-    def point_at(
-        self, camera: Camera, pixel: tuple[int, int], moment: Moment, layer: str = LAYERS[0]
-    ) -> Point | None:
+    def point_at(self, camera: Camera, pixel: tuple[int, int], moment: Moment, layer: str) -> Point | None:
         """Return the world point that a pixel (column, row) shows; None if it shows nothing solid."""
         column, row = (min(max(p, 0), n - 1) for p, n in zip(pixel, (camera.width, camera.height)))
         view = View(camera, torch.tensor([row * camera.width + column]))
@@ -259,8 +255,7 @@ class SceneRenderer:
             now = time.monotonic()
             if self._trajectories is None or now - self._trajectories[0] > self.renewal:
                 cameras = [frame.camera for frame in self.scene.train]
-                chosen = Trajectories(self.module, cameras, **self.tracks)
-                self._trajectories = now, chosen
+                self._trajectories = now, Trajectories(self.module, cameras, **self.tracks)
             overlays.append(self._trajectories[1])
         if self.can_follow and state.followed:
             overlays.append(self._followed(state.followed))
@@ -304,9 +299,9 @@ class Viewer:
 
     @property
     def layers(self) -> tuple[str, ...]:
-        """Which layers all renderers have."""
-        has_layers = bool(self.renderers) and all(len(renderer.layers) > 1 for renderer in self.renderers)
-        return LAYERS if has_layers else LAYERS[:1]
+        """Which parts of the scene can be shown alone, beside all of it, by all renderers."""
+        has_layers = [isinstance(renderer.module.method, HasLayers) for renderer in self.renderers]
+        return LAYERS if has_layers and all(has_layers) else LAYERS[:1]
 
     @property
     def can_follow(self) -> bool:

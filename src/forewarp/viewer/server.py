@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import io
 import ipaddress
 import socket
 import time
@@ -18,7 +19,6 @@ import torch
 import viser
 
 from forewarp.training.stages import Run
-from forewarp.viewer.begin import begin_at, silent
 from forewarp.viewer.page import Page
 from forewarp.viewer.rendering import SceneRenderer, Viewer, ViewState, turning_axis
 
@@ -50,9 +50,7 @@ def serve(viewer: Viewer, *, host: str, port: int, title: str, folder: Path) -> 
     """
     server, pages = _listen(host, port), {}
     try:
-        first = ViewState.first(viewer.scene)
-        begin_at(server, first.pose, first.fov, viewer.focus, viewer.up, viewer.scene.box.diagonal)
-        server.initial_camera.up = tuple(turning_axis(first.pose, viewer.up).tolist())
+        _begin_at(server, viewer, ViewState.first(viewer.scene))
         server.gui.set_panel_label(title)
         server.gui.configure_theme(show_logo=False, show_share_button=False)
         server.gui.main_panel.dock_right()
@@ -72,8 +70,20 @@ def serve(viewer: Viewer, *, host: str, port: int, title: str, folder: Path) -> 
         yield url(host, server.get_port())
     finally:
         viewer.queue.close()
-        with silent():
+        with contextlib.redirect_stdout(io.StringIO()):  # commands have words of their own
             server.stop()
+
+
+def _begin_at(server: viser.ViserServer, viewer: Viewer, first: ViewState) -> None:
+    """Let pages begin at a camera, the scene upright; they turn about the point ahead that is as far away as
+    the focus, or a diagonal of the box if that lies behind.
+    """
+    center, ahead, camera = first.pose[:3, 3], first.pose[:3, 2], server.initial_camera
+    along = float((viewer.focus - center) @ ahead)
+    target = center + ahead * (along if along > 0 else viewer.scene.box.diagonal)
+    server.scene.set_up_direction(tuple(viewer.up.tolist()))
+    camera.position, camera.look_at = tuple(center.tolist()), tuple(target.tolist())
+    camera.fov, camera.up = first.fov, tuple(turning_axis(first.pose, viewer.up).tolist())
 
 
 def _listen(host: str, port: int) -> _Server:
@@ -81,7 +91,7 @@ def _listen(host: str, port: int) -> _Server:
     check_address(host, port)
     # What a page is sent in the moment in which it leaves is lost, as it should be.
     warnings.filterwarnings("ignore", message="Queued a .* on a closed connection", category=UserWarning)
-    with silent():
+    with contextlib.redirect_stdout(io.StringIO()):
         server = _Server(host=host, port=port, verbose=False)
         if port and server.get_port() != port:  # viser takes the next free one and says nothing
             server.stop()

@@ -18,14 +18,11 @@ import torch
 from torch import Tensor
 
 from forewarp.drawing.images import write_video
-from forewarp.viewer.begin import vertical_fov
 from forewarp.viewer.queue import Cancelled, FrameRate, FrameRateControl
-from forewarp.viewer.rendering import Viewer, ViewState
+from forewarp.viewer.rendering import Viewer, ViewState, vertical_fov
 
 if TYPE_CHECKING:
     from forewarp.viewer.page import Page
-
-Progress = Callable[[int, int], None]
 
 MIN_INTERVAL = 1 / 30  # seconds between two images while time plays
 REST_SECONDS = 0.15  # without a change, after which the camera is at rest
@@ -236,7 +233,7 @@ class Session:
         return future.result()
 
     def write_video(
-        self, folder: Path, keys: Sequence[ViewState], seconds: float, progress: Progress
+        self, folder: Path, keys: Sequence[ViewState], seconds: float, progress: Callable[[int, int], object]
     ) -> Path:
         """Write a video through key views into ``folder``, as ``path-<number>.mp4`` that is not there yet.
 

@@ -186,7 +186,7 @@ def test_particles_begin_round_and_no_larger_than_they_are_apart(scene_of):
 
 @compiled
 def test_the_first_steps_meet_warm_kernels_only(monkeypatch):
-    met, data = watch(monkeypatch, "project", "rasterize", "backward", "nodes", "adam"), small_data()
+    met, data = watch(monkeypatch, "project", "rasterize", "nodes", "adam"), small_data()
     module = module_with(data, **EVERY)
     module.method.warm_up()
     warm = met.copy()
@@ -206,8 +206,8 @@ def test_the_process_beside_compiles_for_the_numbers_that_a_step_has():
     script = (
         "import types, torch\n"
         "from forewarp.methods.particles.start import compile_backward, compile_kernels\n"
-        "from forewarp.ops.kernels import backward, rasterize\n"
-        "kernels = (rasterize.compare, backward.splat_gradients, backward.chain)\n"
+        "from forewarp.ops.kernels import project, rasterize\n"
+        "kernels = (rasterize.compare, project.splat_gradients, project.chain)\n"
         "compile_backward(); before = [list(kernel.signatures) for kernel in kernels]\n"
         "assert all(len(found) == 1 for found in before), before\n"
         "compile_kernels(types.SimpleNamespace(means=torch.zeros(1, 3), has_planes=False))\n"

@@ -276,9 +276,8 @@ def draw(records, entries, ends, shares, out):
     for share in prange(len(shares) - 1):
         for tile in range(shares[share], shares[share + 1]):
             row, column = SIDE * (tile // across), SIDE * (tile % across)
-            through, red, green, blue, far, _ = _blend(
-                records, entries, ends[tile], ends[tile + 1], np.float32(column), rows() + row, None, True
-            )
+            first, last, left, y = ends[tile], ends[tile + 1], np.float32(column), rows() + row
+            through, red, green, blue, far, _ = _blend(records, entries, first, last, left, y, None, True)
             put_tile(out[0], row, column, red)
             put_tile(out[1], row, column, green)
             put_tile(out[2], row, column, blue)
@@ -293,19 +292,20 @@ def pull(records, entries, ends, shares, gradients, kept, sums):
     """
     across = gradients.shape[2] // SIDE
     for share in prange(len(shares) - 1):
-        sums[share] = 0
+        own, added = kept[share], sums[share]
+        added[:] = 0
         for tile in range(shares[share], shares[share + 1]):
             first, last = ends[tile], ends[tile + 1]
             if first == last:
                 continue
             row, column = SIDE * (tile // across), SIDE * (tile % across)
             left, y = np.float32(column), rows() + row
-            count = _blend(records, entries, first, last, left, y, kept[share], None)[5]
+            count = _blend(records, entries, first, last, left, y, own, None)[5]
             # The last plane is what is let through: its gradient stands behind everything, times 1.
             red, green = get_tile(gradients[0], row, column), get_tile(gradients[1], row, column)
             blue, far = get_tile(gradients[2], row, column), get_tile(gradients[3], row, column)
             behind, of = get_tile(gradients[4], row, column), (red, green, blue)
-            _walk_back(records, entries, first, count, left, y, kept[share], of, far, behind, sums[share])
+            _walk_back(records, entries, first, count, left, y, own, of, far, behind, added)
 
 
 # Compare ---------------------------------------------------------------------------------------------------
@@ -352,13 +352,13 @@ def compare(
     """
     across = pixels.shape[1] // SIDE
     for share in prange(len(shares) - 1):
-        score = np.zeros(3, np.float64)
-        sums[share] = 0
+        score, own, added = np.zeros(3, np.float64), kept[share], sums[share]
+        added[:] = 0
         for tile in range(shares[share], shares[share + 1]):
             row, column = SIDE * (tile // across), SIDE * (tile % across)
-            left, y, first = np.float32(column), rows() + row, ends[tile]
+            first, last, left, y = ends[tile], ends[tile + 1], np.float32(column), rows() + row
             through, red, green, blue, far, count = _blend(
-                records, entries, first, ends[tile + 1], left, y, kept[share], planes
+                records, entries, first, last, left, y, own, planes
             )
             inside = where_above(wide - widened(narrow_columns() + left), _ZERO, lanes(1.0))
             inside = where_above(high - y, _ZERO, inside)
@@ -367,28 +367,20 @@ def compare(
             red = _residual(pixels, row, column, through, red, background[0], 0, inside)
             green = _residual(pixels, row, column, through, green, background[1], 1, inside)
             blue = _residual(pixels, row, column, through, blue, background[2], 2, inside)
-            if (
-                planes is None and total(fma(red, red, fma(green, green, blue * blue))) == 0
-            ):  # which NaN is not
+            # Nothing to learn from; NaN is not 0.
+            if planes is None and total(fma(red, red, fma(green, green, blue * blue))) == 0:
                 continue
-            red, green, blue = (
-                _score(red, width, score),
-                _score(green, width, score),
-                _score(blue, width, score),
-            )
+            red = _score(red, width, score)
+            green = _score(green, width, score)
+            blue = _score(blue, width, score)
             behind = fma(red, background[0], fma(green, background[1], blue * background[2]))
             of = (red, green, blue)
             if planes is None:
-                _walk_back(
-                    records, entries, first, count, left, y, kept[share], of, None, behind, sums[share]
-                )
+                _walk_back(records, entries, first, count, left, y, own, of, None, behind, added)
             else:
                 inverse = get_tile(planes[1], row, column)
                 error = fma(far, inverse, through) - np.float32(1)
                 by_error = _score_depth(error, get_tile(planes[2], row, column), deep, score)
                 by_far, behind = by_error * inverse, behind + by_error
-                _walk_back(
-                    records, entries, first, count, left, y, kept[share], of, by_far, behind, sums[share]
-                )
-        for number in range(3):
-            scores[share, number] = score[number]
+                _walk_back(records, entries, first, count, left, y, own, of, by_far, behind, added)
+        scores[share] = score
