@@ -30,8 +30,7 @@ class Component(NamedTuple):
 
 FLOAT, UINT = Component(5126, "<f4"), Component(5125, "<u4")
 BYTE, SHORT = Component(5121, "<u1"), Component(5123, "<u2")  # both unsigned
-UNIT_BYTE, UNIT_SHORT = BYTE._replace(one=255), SHORT._replace(one=65535)
-SIGNED_UNIT_SHORT = Component(5122, "<i2", 32767)
+UNIT_BYTE, SIGNED_UNIT_SHORT = BYTE._replace(one=255), Component(5122, "<i2", 32767)
 COMPONENTS = {c.number: c for c in (FLOAT, UINT, BYTE, SHORT, Component(5120, "<i1"), SIGNED_UNIT_SHORT)}
 
 
