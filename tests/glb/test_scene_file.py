@@ -13,7 +13,7 @@ import torch
 import forewarp
 from forewarp.fields.curves import Curve
 from forewarp.fields.moving import MovingGaussians, NodeMotion
-from forewarp.glb.reader import Container, read
+from forewarp.glb.reader import Container, Fields, read
 from forewarp.glb.writer import COMPACT, LOSSLESS, MOTION, SPLATS, Setting, morton, rows_in_file, write
 from forewarp.scene.camera import Lens
 from forewarp.scene.cloud import Ellipsoids
@@ -402,10 +402,10 @@ def test_accessors_of_one_view_take_no_more_memory_than_views_may(every, monkeyp
     description["accessors"].append(one | {"type": "VEC3", "normalized": True})
     monkeypatch.setattr("forewarp.glb.reader._MOST", 24 * rows - 1)
     container = Container(packed(description, binary))
-    number = len(description["accessors"]) - 1
-    container.array(number, "VEC3", place="here")
-    with pytest.raises(ValueError, match=r"^here: expected at most \d+ bytes in all, but got more"):
-        container.array(number, "VEC3", place="here")
+    part = Fields({"colors": len(description["accessors"]) - 1}, "here")
+    container.array(part, "colors", "VEC3")
+    with pytest.raises(ValueError, match=r"^here.colors: expected at most \d+ bytes in all, but got more"):
+        container.array(part, "colors", "VEC3")
 
 
 def test_whole_numbers_of_nodes_are_lengths(every, kept):
