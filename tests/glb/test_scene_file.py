@@ -224,6 +224,7 @@ WRONG = {
     "another major version": (in_motion("version", "2.0"), "expected version 1.1, but got '2.0'"),
     "no version": (in_motion("version", None), "version: expected a text, but got none"),
     "an unknown feature": (in_motion("features", ["births"]), "features known here, but got 'births'"),
+    "a feature that is no name": (in_motion("features", [[]]), "features known here, but got []"),
     "an unknown extension": (setter(["extensionsRequired"], ["KHR_x"]), "known here, but got 'KHR_x'"),
     "no extension": (
         lambda d: d["meshes"][0]["primitives"][0].pop("extensions"),

@@ -23,8 +23,8 @@ from forewarp.glb.writer import FORMAT, MOTION, SPLATS, WINDOWS, Setting
 from forewarp.ops.gaussians import LEAST_LOG
 from forewarp.scene.camera import Camera, Lens
 
-_EXTENSIONS = {COMPRESSION, SPLATS, MOTION}  # that a file may require
-_FEATURES = {WINDOWS}  # names that a file may list of what a reader must know
+_EXTENSIONS = COMPRESSION, SPLATS, MOTION  # that a file may require
+_FEATURES = (WINDOWS,)  # names that a file may list of what a reader must know
 # At most: degree of the harmonics, cosines over time, accessors of links.
 _MOST = 1 << 28  # bytes of the file, and of all its arrays: some 200,000 particles of degree 3
 _DEGREES, _COSINES, _LINKS = 3, 64, 16
@@ -93,7 +93,7 @@ class Fields:
         good = lambda value: isinstance(value, list) and len(value) <= most  # noqa: E731
         return self._get(key, f"a list of at most {most}", good, [])
 
-    def check_known(self, key: str, known: set[str]) -> None:
+    def check_known(self, key: str, known: tuple[str, ...]) -> None:
         """Refuse a list with other names than those that are known here."""
         if others := [name for name in self.items(key) if name not in known]:
             got = short(others[0])
