@@ -13,6 +13,7 @@ import torch
 import forewarp
 from forewarp.fields.curves import Curve
 from forewarp.fields.moving import MovingGaussians, NodeMotion
+from forewarp.fields.windows import Window
 from forewarp.glb.reader import Container, Fields, read
 from forewarp.glb.writer import COMPACT, LOSSLESS, MOTION, SPLATS, Setting, morton, rows_in_file, write
 from forewarp.scene.camera import Lens
@@ -67,7 +68,7 @@ def written(gaussians, quality=LOSSLESS, cameras=CAMERAS):
     setting = Setting(
         cameras, torch.eye(3, dtype=torch.float64), torch.ones(3).double(), 2.5, (0.0, 0.5, 1.0)
     )
-    return write(gaussians, setting, quality, rows_in_file(gaussians))
+    return write([(Window(gaussians, (0.0, 1.0), 0.0), rows_in_file(gaussians))], setting, quality)
 
 
 @pytest.fixture(scope="module")

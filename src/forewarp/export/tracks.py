@@ -17,7 +17,7 @@ from torch import Tensor
 from forewarp.drawing.images import hidden
 from forewarp.evaluation.images import within
 from forewarp.evaluation.trajectories import seen_by, surface
-from forewarp.glb.container import UINT, Buffer
+from forewarp.glb.container import UINT, Buffer, quaternion_of
 from forewarp.methods.method import HasEllipsoids, HasMatter, HasTrajectories, Method
 from forewarp.scene.camera import Camera, mean_up
 from forewarp.scene.cloud import far_apart
@@ -292,8 +292,6 @@ def glb(tracks: Tracks, radius: float, rotation: Tensor, seconds: float) -> byte
         rotation: (3, 3) of the scene's only node.
         seconds: duration of the animation from time 0 to time 1.
     """
-    from scipy.spatial.transform import Rotation
-
     total = len(tracks.times)
     opacity = tracks.opacity / tracks.opacity.amax(0).clamp(min=1e-6)
     scale = radius * opacity.expand(total, -1)[..., None, None]
@@ -318,14 +316,10 @@ def glb(tracks: Tracks, radius: float, rotation: Tensor, seconds: float) -> byte
         sampler = {"input": clock, "output": weights, "interpolation": "LINEAR"}
         channel = {"sampler": 0, "target": {"node": 0, "path": "weights"}}
         animation = {"animations": [{"name": "time", "samplers": [sampler], "channels": [channel]}]}
-    quaternion = Rotation.from_matrix(rotation.numpy()).as_quat().tolist()  # x, y, z, w
     unlit = {"extensions": {"KHR_materials_unlit": {}}, "pbrMetallicRoughness": {"metallicFactor": 0}}
     description = {
-        "asset": {"version": "2.0", "generator": "forewarp"},
         "extensionsUsed": ["KHR_materials_unlit"],
-        "scene": 0,
-        "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0, "rotation": quaternion, "name": "points"}],
+        "nodes": [{"mesh": 0, "rotation": quaternion_of(rotation), "name": "points"}],
         "meshes": [mesh],
         "materials": [unlit],
     }

@@ -18,7 +18,7 @@ from forewarp.fields.moving import MARGIN, MovingGaussians, NodeMotion
 from forewarp.fields.windows import MovingWindows, Window, check_windows, taken, with_shared
 from forewarp.files import MOST_CONFIG, read_bytes
 from forewarp.glb import meshopt
-from forewarp.glb.container import CHUNKS, COMPONENTS, COMPRESSION, ELEMENTS, MAGIC, VERSION
+from forewarp.glb.container import CAMERA_AXES, CHUNKS, COMPONENTS, COMPRESSION, ELEMENTS, MAGIC, VERSION
 from forewarp.glb.writer import FORMAT, MOTION, SPLATS, WINDOWS, Setting
 from forewarp.ops.gaussians import LEAST_LOG
 from forewarp.scene.camera import Camera, Lens
@@ -470,7 +470,7 @@ def _rotation(node: Fields) -> torch.Tensor:
 
 def _camera(node: Fields, extras: Fields, perspective: Fields) -> Camera:
     pose = torch.eye(4, dtype=torch.float64)
-    pose[:3, :3] = _rotation(node) * torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64)
+    pose[:3, :3] = _rotation(node) * CAMERA_AXES
     pose[:3, 3] = torch.tensor(node.numbers("translation", 3, [0, 0, 0]), dtype=torch.float64)
     lens = extras.numbers("lens", 5) if "lens" in extras else None
     return Camera(
