@@ -13,7 +13,7 @@ from forewarp.export.tracks import Progress, Source, no_progress
 from forewarp.fields.moving import MovingGaussians
 from forewarp.fields.windows import Window
 from forewarp.glb.writer import COMPACT, Rows, Setting, rows_in_file, write
-from forewarp.methods.method import HasBounds, HasCommon, HasLayers, HasMovingGaussians
+from forewarp.methods.method import HasCommon, HasLayers, HasMovingGaussians
 from forewarp.ops.backend import has_kernels
 from forewarp.scene.camera import focus_point
 from forewarp.scene.frame import Frame, spread
@@ -61,12 +61,7 @@ def packed_scene(
         ValueError: for a method without particles, naming the formats that it has; where nothing is seen.
     """
     if not isinstance(source.method, HasMovingGaussians):
-        others = ["mesh"] if isinstance(source.method, HasBounds) else []
-        others += ["gltf", "ply", "npz"] if source.follows else []
-        instead = f"; use format={' or '.join(others)}" if others else ""
-        raise ValueError(
-            f"format={kind}: expected a method made of particles, but got {source.model}{instead}"
-        )
+        raise source.without_particles(kind)
     windows = [source, *source.later]
     shared = shared_in(windows)
     count, images, parts = sum(len(window.cameras) for window in windows), itertools.count(1), []
@@ -152,13 +147,9 @@ def moving_in_images(source: Source) -> Tensor | None:
     """Return which particles (N,) training images show in motion; None: whoever follows nodes."""
     if not source.image_times or not isinstance(source.method, HasLayers):
         return None
-    pairs = zip(source.cameras, source.image_times)
-    frames = [Frame("", time, camera, _not_loaded) for camera, time in pairs]
+    # Motion is told from cameras and times alone; no image is loaded.
+    frames = [Frame("", *pair, load=None) for pair in zip(source.image_times, source.cameras)]
     return source.method.in_motion(frames).cpu()
-
-
-def _not_loaded() -> Tensor:
-    raise NotImplementedError  # motion is told from cameras and times alone
 
 
 def seen_in_images(gaussians: MovingGaussians, source: Source, tell: Callable[[], None]) -> Tensor | None:

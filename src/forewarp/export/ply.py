@@ -153,7 +153,7 @@ def header_comments(source: Source, rotation: Tensor) -> list[str]:
     """Return what viewers read in a header: ``Vertical axis: z``, as nerfstudio and Brush write it, where the
     images' mean upward direction, after a rotation (3, 3), is along an axis or against it; else nothing.
     """
-    upwards = (rotation @ mean_up(list(source.cameras)).double()).abs()
+    upwards = (rotation @ mean_up(source.cameras)).abs()
     return [f"Vertical axis: {'xyz'[int(upwards.argmax())]}"] if float(upwards.max()) > ALONG else []
 
 
@@ -179,10 +179,8 @@ def export_ply(
     """
     rotation, total = source.rotation_to(up), len(source.times)
     if compressed and not source.has_ellipsoids:
-        raise ValueError(
-            f"compressed: expected a run of particles, as it is a format of theirs, but got one of "
-            f"{source.model}; leave it out"
-        )
+        got = f"one of {source.model}"
+        raise ValueError(f"compressed: expected a run of particles, but got {got}; leave it out")
     (folder / "frames").mkdir()
     suffix = ".compressed.ply" if compressed else ".ply"
     files = [folder / "frames" / f"frame_{number:04d}{suffix}" for number in range(total)]

@@ -18,7 +18,7 @@ from forewarp.drawing.images import hidden
 from forewarp.evaluation.images import within
 from forewarp.evaluation.trajectories import seen_by, surface
 from forewarp.glb.container import UINT, Buffer, quaternion_of
-from forewarp.methods.method import HasEllipsoids, HasMatter, HasTrajectories, Method
+from forewarp.methods.method import HasBounds, HasEllipsoids, HasMatter, HasTrajectories, Method
 from forewarp.scene.camera import Camera, mean_up
 from forewarp.scene.cloud import far_apart
 from forewarp.scene.frame import spread
@@ -76,8 +76,8 @@ class Source:
 
         if up == "world":
             return torch.eye(3, dtype=torch.float64)
-        before = mean_up(list(self.cameras)).numpy()
-        return torch.from_numpy(Rotation.align_vectors([_UP[up]], [before])[0].as_matrix())
+        rotation, _ = Rotation.align_vectors([_UP[up]], [mean_up(self.cameras).numpy()])
+        return torch.from_numpy(rotation.as_matrix())
 
     @property
     def follows(self) -> bool:
@@ -85,17 +85,12 @@ class Source:
         points = isinstance(self.method, HasTrajectories) and isinstance(self.method, HasMatter)
         return self.has_ellipsoids or points
 
-    def check_tracks(self, kind: str) -> None:
-        """Refuse a method that ``tracks_of`` cannot follow.
-
-        Raises:
-            ValueError: naming the format ``kind``.
-        """
-        if not self.follows:
-            raise ValueError(
-                f"format={kind}: expected a method whose points can be followed, as particles, forward or "
-                f"backward, but got {self.model}"
-            )
+    def without_particles(self, kind: str) -> ValueError:
+        """Return the refusal of a format that asks for particles, naming those that there are."""
+        others = ["mesh"] if isinstance(self.method, HasBounds) else []
+        others += ["gltf", "ply", "npz"] if self.follows else []
+        got = self.model + (f"; use format={' or '.join(others)}" if others else "")
+        return ValueError(f"format={kind}: expected a method made of particles, but got {got}")
 
 
 @dataclass(frozen=True)
