@@ -5,10 +5,9 @@ from __future__ import annotations
 import json
 import math
 import struct
-from dataclasses import dataclass
 from pathlib import Path
 from reprlib import repr as short
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -239,13 +238,11 @@ def _parsed(text: bytes) -> Any:
         raise ValueError(f"expected JSON, but got {short(str(error))}") from None
 
 
-@dataclass(frozen=True)
-class Contents:
-    """What a file holds: ``gaussians``, in its order, and their ``setting``; its format's ``version``."""
+class Contents(NamedTuple):
+    """What a file holds: ``gaussians``, in its order, and their ``setting``."""
 
     gaussians: MovingGaussians | MovingWindows
     setting: Setting
-    version: str
 
 
 def read(path: Path) -> Contents:
@@ -281,7 +278,7 @@ def _scene(container: Container) -> Contents:
         motion.number("seconds", 1e-3, 1e6, 4),
         tuple(motion.numbers("background", 3, [1, 1, 1])),
     )
-    return Contents(gaussians, setting, version)
+    return Contents(gaussians, setting)
 
 
 def _windows(container: Container, first: MovingGaussians, motion: Fields) -> MovingWindows:

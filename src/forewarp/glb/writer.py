@@ -213,9 +213,9 @@ class _Store(Buffer):
         return self.add(np.rint(values * UNIT_BYTE.one), UNIT_BYTE, **options)
 
 
-# How finely compact files store (docs/exports.md says what that costs). Positions and standard deviations, and
-# nodes' translations: as shares of what a pixel of the cameras spans. Standard deviations, too, and rotations:
-# by bits of their own.
+# How finely compact files store (docs/exports.md says what that costs). As shares of what a pixel of cameras
+# spans: positions and standard deviations; translations of nodes. By bits: standard deviations, of their own,
+# where that is coarser; rotations.
 _LENGTH, _CURVE = 1 / 16, 1 / 32
 _SCALE_BITS, _ROTATION_BITS = 6, 8
 # Coefficients of the constant harmonic and of others, colours over time, opacity over time as logits, and the
