@@ -130,7 +130,7 @@ def with_shared(own: MovingGaussians, still: MovingGaussians) -> MovingGaussians
     return replace(own, **parts, motion=motion)
 
 
-def taken(gaussians: MovingGaussians, rows: Tensor) -> MovingGaussians:
+def taken(gaussians: MovingGaussians, rows: Tensor | slice) -> MovingGaussians:
     """Return some rows of Gaussians, which follow no nodes."""
     names = ("means", "log_scales", "quaternions", "opacity", "harmonics")
     parts = {name: getattr(gaussians, name)[rows] for name in names}

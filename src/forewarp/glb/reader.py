@@ -287,14 +287,14 @@ def _windows(container: Container, first: MovingGaussians, motion: Fields) -> Mo
     parts, meshes = about.parts("list"), description.parts("meshes")
     if not 2 <= len(parts) <= _WINDOWS:
         raise ValueError(f"{about.place}.list: expected 2 to {_WINDOWS} windows, but got {len(parts)}")
-    still = torch.arange(len(first.means))[len(first.means) - about.whole("shared", 0, len(first.means), 0) :]
+    shared = taken(first, slice(len(first.means) - about.whole("shared", 0, len(first.means), 0), None))
     spans = [tuple(part.numbers("span", 2)) for part in parts]
     begins = [part.number("from", 0, 1) for part in parts]
     if not all(0 <= begin < end <= 1 for begin, end in spans):
         raise ValueError(f"{about.place}.list: expected spans in [0, 1], but got {short(spans)}")
     fade = about.number("fade", 0, 0.5, 0)
     check_windows(begins, spans, fade)
-    gaussians, shared = [first], taken(first, still)
+    gaussians = [first]
     for part in parts[1:]:
         if (held := _held(meshes, part)) is None:
             raise ValueError(f"{part.place}.mesh: expected Gaussians with {MOTION}, but got none")
