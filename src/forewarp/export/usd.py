@@ -72,8 +72,8 @@ def export_usd(
     field.CreateRadianceSphericalHarmonicsDegreeAttr(degree)
     field.CreateSortingModeHintAttr("cameraDistance")
     reach = _REACH * max(float(cloud["scales"].max()) for cloud in clouds)
-    corners = [cloud["positions"] for cloud in clouds]
-    low, high = np.min([c.min(0) for c in corners], 0) - reach, np.max([c.max(0) for c in corners], 0) + reach
+    places = np.stack([cloud["positions"] for cloud in clouds])
+    low, high = places.min((0, 1)) - reach, places.max((0, 1)) + reach
     field.CreateExtentAttr(Vt.Vec3fArray([Gf.Vec3f(*low.tolist()), Gf.Vec3f(*high.tolist())]))
     attributes = {
         "positions": (field.CreatePositionsAttr(), Vt.Vec3fArray),
