@@ -1,7 +1,6 @@
 """A film in windows: one file, what stands still stored once, each window drawn at its own time."""
 
 import copy
-import json
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -12,7 +11,7 @@ import forewarp
 from forewarp.export.glb import packed_scene, shared_in
 from forewarp.export.tracks import Source
 from forewarp.fields.windows import MovingWindows, check_windows
-from forewarp.glb.reader import Container, read
+from forewarp.glb.reader import read
 from forewarp.methods.method import Start
 from forewarp.methods.particles import shared
 from forewarp.methods.particles.model import Particles
@@ -23,6 +22,7 @@ from tests.export.test_html import SETTLED, drawn
 from tests.glb.plain_reader import PlainScene
 from tests.glb.test_plain_reader import assert_alike
 from tests.support.browser import Tab, chromium, until
+from tests.support.gltf import motion_of, packed, unpacked
 from tests.support.particles import BARE, EVERY, module_with, small_data
 
 SPANS = (0.0, 0.55), (0.45, 1.0)
@@ -151,15 +151,9 @@ def test_a_single_window_is_a_file_like_any_other(film, tmp_path):
 )
 def test_windows_that_cannot_be_are_refused(written, change, line):
     file, _ = written()
-    data = file.read_bytes()
-    content = copy.deepcopy(Container(data).description.content)
-    splats = content["meshes"][0]["primitives"][0]["extensions"]["KHR_gaussian_splatting"]
-    splats["extensions"]["FOREWARP_gaussian_motion"]["windows"] |= change
-    text = json.dumps(content).encode()
-    text += b" " * (-len(text) % 4)
-    length = int.from_bytes(data[12:16], "little")
-    body = len(text).to_bytes(4, "little") + b"JSON" + text + data[20 + length :]
-    file.write_bytes(data[:8] + (12 + len(body)).to_bytes(4, "little") + body)
+    description, binary = unpacked(file.read_bytes())
+    motion_of(description)["windows"] |= change
+    file.write_bytes(packed(description, binary))
     with pytest.raises(ValueError, match=line):
         read(file)
 

@@ -1,6 +1,5 @@
 """What is written is read back; what is none of ours is refused."""
 
-import json
 import math
 import struct
 import tracemalloc
@@ -19,6 +18,7 @@ from forewarp.glb.writer import COMPACT, LOSSLESS, MOTION, SPLATS, Setting, mort
 from forewarp.scene.camera import Lens
 from forewarp.scene.cloud import Ellipsoids
 from forewarp.scene.view import Moment, View
+from tests.support.gltf import attributes_of, motion_of, packed, unpacked
 from tests.support.tiny_scene import ball_scene
 
 CAMERAS = [frame.camera for frame in ball_scene(frames=5, size=20).train]
@@ -65,9 +65,8 @@ def moving(kind="spline", *, natural=True, rotates=True, over_time=0, rests=Fals
 
 
 def written(gaussians, quality=LOSSLESS, cameras=CAMERAS):
-    setting = Setting(
-        cameras, torch.eye(3, dtype=torch.float64), torch.ones(3).double(), 2.5, (0.0, 0.5, 1.0)
-    )
+    rotation, focus = torch.eye(3).double(), torch.ones(3).double()
+    setting = Setting(cameras, rotation, focus, 2.5, (0.0, 0.5, 1.0))
     return write([(Window(gaussians, (0.0, 1.0), 0.0), rows_in_file(gaussians))], setting, quality)
 
 
@@ -158,46 +157,18 @@ def test_points_near_each_other_lie_near_each_other_in_a_file():
 
 
 def test_a_scene_of_one_particle_at_rest(kept):
-    one = torch.zeros(1, 3)
-    colors = torch.full((1, 1, 3), 0.3)
-    still = MovingGaussians(
-        one, one - 1, torch.zeros(1, 4), torch.zeros(1), colors, None, None, 0.0, 0.1, None
-    )
+    one, colors = torch.zeros(1, 3), torch.full((1, 1, 3), 0.3)
+    still = MovingGaussians(one, one - 1, torch.zeros(1, 4), one[:, 0], colors, None, None, 0.0, 0.1, None)
     for quality in (LOSSLESS, COMPACT):
         held = read(kept(written(still, quality))).gaussians
         assert not held.moves
         torch.testing.assert_close(held.means, one)
-        torch.testing.assert_close(
-            held.at(Moment(0.3)).gaussians.opacity, torch.zeros(1, 1), rtol=0, atol=0.01
-        )
+        assert held.at(Moment(0.3)).gaussians.opacity.tolist() == [[pytest.approx(0.0, abs=0.01)]]
         turned = held.template().roots  # a quaternion of length 0 turns nothing
         torch.testing.assert_close(turned, math.exp(-1) * torch.eye(3)[None], rtol=0, atol=0.01)
 
 
 # What is refused -------------------------------------------------------------------------------------------
-
-
-def unpacked(data):
-    """The description of a file, and its arrays."""
-    size = struct.unpack_from("<I", data, 12)[0]
-    return json.loads(data[20 : 20 + size]), data[28 + size :]
-
-
-def packed(description, binary):
-    text = description if isinstance(description, bytes) else json.dumps(description).encode()
-    text += b" " * (-len(text) % 4)
-    body = (
-        struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(binary), b"BIN\0") + binary
-    )
-    return struct.pack("<4sII", b"glTF", 2, 12 + len(body)) + body
-
-
-def motion_of(description):
-    return description["meshes"][0]["primitives"][0]["extensions"][SPLATS]["extensions"][MOTION]
-
-
-def attributes_of(description):
-    return description["meshes"][0]["primitives"][0]["attributes"]
 
 
 def setter(path, value):
@@ -228,44 +199,32 @@ WRONG = {
     "a feature that is no name": (in_motion("features", [[]]), "features known here, but got []"),
     "an unknown extension": (setter(["extensionsRequired"], ["KHR_x"]), "known here, but got 'KHR_x'"),
     "no extension": (
-        lambda d: d["meshes"][0]["primitives"][0].pop("extensions"),
+        setter(["meshes", 0, "primitives", 0, "extensions"], None),
         f"expected Gaussians with {MOTION}, but got a glTF without",
     ),
     "no meshes": (setter(["meshes"], []), "mesh: expected a whole number from 0 to -1, but got 0"),
     "an accessor that there is not": (in_motion("nodes", "positions", 999), "accessors, but got 999"),
     "a negative accessor": (in_motion("links", [-1]), "accessors, but got -1"),
     "no positions": (lambda d: attributes_of(d).pop("POSITION"), "POSITION: expected one of"),
-    "no second harmonic": (
+    "a lost harmonic": (
         lambda d: attributes_of(d).pop(f"{SPLATS}:SH_DEGREE_2_COEF_4"),
-        "SH_DEGREE_2_COEF_4: expected one of",
+        "COEF_4: expected",
     ),
     "another type": (setter(["accessors", 0, "type"], "VEC4"), "POSITION: expected rows of VEC3, but got"),
     "too many rows": (setter(["accessors", 1, "count"], 10**6), "ROTATION: expected"),
-    "absurd counts": (
-        setter(["accessors", 0, "count"], 2**60),
-        "count: expected a whole number from 1 to 268435456, but got",
-    ),
+    "absurd counts": (setter(["accessors", 0, "count"], 2**60), "count: expected a whole number from 1"),
     "an absurd view": (
         lambda d: [setter([*COMPRESSED, "count"], 2**27)(d), setter(["accessors", 0, "count"], 2**27)(d)],
         "expected at most 268435456 bytes in all",
     ),
-    "a large view": (
-        setter([*COMPRESSED, "count"], 10**7),
-        "expected 10000000 elements by attribute codec 0",
-    ),
+    "a large view": (setter([*COMPRESSED, "count"], 10**7), "expected 10000000 elements by attribute codec"),
     "a view beyond the end": (setter([*COMPRESSED, "byteOffset"], 2**30), "bytes, but got"),
-    "an unknown filter": (
-        setter([*COMPRESSED, "filter"], "COLOR"),
-        "expected attributes, but got ATTRIBUTES by",
-    ),
+    "an unknown filter": (setter([*COMPRESSED, "filter"], "COLOR"), "but got ATTRIBUTES by COLOR"),
     "triangles": (setter([*COMPRESSED, "mode"], "TRIANGLES"), "but got TRIANGLES"),
     "an odd stride": (setter([*COMPRESSED, "byteStride"], 6), "expected a stride of"),
     "a sparse accessor": (setter(["accessors", 0, "sparse"], {}), "expected plain numbers"),
     "an unknown component": (setter(["accessors", 0, "componentType"], 5130), "expected plain numbers"),
-    "a word for a number": (
-        in_motion("canonicalTime", "soon"),
-        "canonicalTime: expected a number from 0 to 1",
-    ),
+    "a word for a number": (in_motion("canonicalTime", "soon"), "canonicalTime: expected a number from 0"),
     "true for a number": (in_motion("moving", True), "moving: expected a whole number from"),
     "more in motion": (in_motion("inMotion", 10**5), "inMotion: expected a whole number from 0 to"),
     "more that move": (in_motion("moving", 10**5), "moving: expected a whole number from 0 to"),
@@ -354,35 +313,27 @@ def test_a_file_that_there_is_not_is_named(tmp_path):
         forewarp.load(tmp_path / "nothing.glb")
 
 
-@pytest.mark.parametrize("value", [math.nan, math.inf])
-@pytest.mark.parametrize("key", ["POSITION", f"{SPLATS}:SCALE", "translations", "weights"])
-def test_numbers_that_are_none_are_refused(every, kept, key, value):
-    description, binary = unpacked(written(every))
-    motion = motion_of(description)
-    number = {"translations": motion["nodes"]["translations"], "weights": motion["weights"][0]}.get(key)
-    number = attributes_of(description)[key] if number is None else number
-    begin = description["bufferViews"][description["accessors"][number]["bufferView"]]["byteOffset"]
-    wrong = binary[:begin] + struct.pack("<f", value) + binary[begin + 4 :]
-    with pytest.raises(ValueError, match=f"{key}: expected finite numbers, but got others"):
-        read(kept(packed(description, wrong)))
+FLOATS = "POSITION", f"{SPLATS}:SCALE", "translations", "weights"
 
 
 @pytest.mark.parametrize(
     ("key", "dtype", "value", "says"),
     [
+        *((key, "<f4", math.nan, f"{key}: expected finite numbers, but got others") for key in FLOATS),
+        ("POSITION", "<f4", math.inf, "POSITION: expected finite numbers"),
         ("links", "<u1", 255, "links: expected numbers below"),
         ("weights", "<f4", -1.0, "weights: expected numbers >= 0"),
         (f"{SPLATS}:OPACITY", "<f4", 1.5, "OPACITY: expected numbers in its range"),
         (f"{SPLATS}:SCALE", "<f4", -1.0, "SCALE: expected numbers in its range"),
         ("times", "<f4", 2.0, "expected ascending times"),
-        ("times", "<f4", -0.5, r"expected ascending times in [0, 1]"),
+        ("times", "<f4", -0.5, "expected ascending times in [0, 1]"),
         ("offsets", "<f4", 0.5, "offsets of at most 0.2"),
     ],
 )
-def test_numbers_out_of_range_are_refused(every, kept, key, dtype, value, says):
+def test_numbers_that_are_none_or_out_of_range_are_refused(every, kept, key, dtype, value, says):
     description, binary = unpacked(written(every))
     motion = motion_of(description)
-    places = attributes_of(description) | motion["timeOffsets"]
+    places = attributes_of(description) | motion["timeOffsets"] | motion["nodes"]
     places |= {name: motion[name][0] for name in ("links", "weights")}
     begin = description["bufferViews"][description["accessors"][places[key]]["bufferView"]]["byteOffset"]
     stored = np.array([value], dtype).tobytes()
