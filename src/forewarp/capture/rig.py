@@ -45,6 +45,7 @@ from forewarp.data.transforms import numbers_in
 from forewarp.data.video import VIDEOS, extracted, sound_of, stamps_of, start_of
 from forewarp.drawing.images import write_png
 from forewarp.files import folder_written_whole, read_json, write_json
+from forewarp.ops.backend import is_number
 
 _INSTANTS, _POLLUTED = 9, 1 / 3  # of a still; share of them in which a pixel that moves is not matched
 _SEEK = 600  # frames after which a film's instants are sought, not decoded on the way
@@ -236,7 +237,7 @@ def offsets_of(
         expected = "expected seconds for each camera, sound, none or null"
         raise ValueError(f"offsets: {expected}, but got {wanted!r}; set offsets=")
     for name, value in values.items():
-        if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
+        if not is_number(value):
             raise ValueError(f"offsets: expected seconds, but got {value!r} of {name}; set offsets=")
     chosen = np.array([float(values[film.name]) for film in films])
     if not is_timed and np.ptp(chosen) > 0:

@@ -19,6 +19,7 @@ from forewarp.files import MOST_CONFIG, read_bytes
 from forewarp.glb import meshopt
 from forewarp.glb.container import CAMERA_AXES, CHUNKS, COMPONENTS, COMPRESSION, ELEMENTS, MAGIC, VERSION
 from forewarp.glb.writer import FORMAT, MOTION, SPLATS, WINDOWS, Setting
+from forewarp.ops.backend import is_number
 from forewarp.ops.gaussians import LEAST_LOG
 from forewarp.scene.camera import Camera, Lens
 
@@ -63,7 +64,7 @@ class Fields:
     def number(self, key: str, least: float, most: float, default: float | None = None) -> float:
         """Return a number from ``least`` to ``most``."""
         expected = f"a number from {least:g} to {most:g}"
-        return float(self._get(key, expected, lambda x: _is_number(x) and least <= x <= most, default))
+        return float(self._get(key, expected, lambda x: is_number(x) and least <= x <= most, default))
 
     def fixed(self, key: str, value: float) -> None:
         """Refuse a number, if there is one, that is not the only one that version 1 has."""
@@ -75,7 +76,7 @@ class Fields:
 
         def good(values) -> bool:
             some = isinstance(values, list) and len(values) == count
-            return some and all(_is_number(x) and abs(x) < 1e30 for x in values)
+            return some and all(is_number(x) and abs(x) < 1e30 for x in values)
 
         return list(map(float, self._get(key, f"{count} numbers", good, default)))
 
@@ -105,10 +106,6 @@ class Fields:
     def part(self, key: str, default: dict | None = None) -> Fields:
         """Return a part."""
         return Fields(self.content.get(key, default), f"{self.place}.{key}")
-
-
-def _is_number(value: Any) -> bool:
-    return type(value) in (int, float)
 
 
 class Container:

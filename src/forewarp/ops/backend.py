@@ -7,8 +7,8 @@ off. Tests hold both to the same values and gradients.
 from __future__ import annotations
 
 import importlib.util
-import math
 import os
+import sys
 import threading
 from functools import cache
 from typing import Any
@@ -66,8 +66,13 @@ def match_threads() -> int:
 
 
 def is_number(value: Any) -> bool:
-    """Return whether a value, as a config may hold any, is a finite number; true and false are none."""
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+    """Return whether a value, as a config may hold any, is a finite number; true and false are none.
+
+    >>> is_number(1), is_number(True), is_number(10**400)
+    (True, False, False)
+    """
+    is_real = isinstance(value, int | float) and not isinstance(value, bool)
+    return is_real and abs(value) <= sys.float_info.max  # an integer may be beyond every float
 
 
 def check_shape(name: str, tensor: Tensor, shape: tuple[int | str, ...]) -> None:
