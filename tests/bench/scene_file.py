@@ -11,8 +11,9 @@ from statistics import fmean
 
 import torch
 
+from forewarp.cli.export import source_of
 from forewarp.export.formats import write
-from forewarp.export.tracks import Source, no_progress
+from forewarp.export.tracks import no_progress
 from forewarp.metrics.image import psnr
 from forewarp.runs.config import saved_config
 from forewarp.runs.fitted import open_file, opened
@@ -25,9 +26,7 @@ def row(folder: str) -> str:
 
     run, module = opened(saved_config(folder, OmegaConf.create({"trust": []})))
     scene, targets = run.datamodule.scene, run.datamodule.targets("test")
-    background = tuple(targets.background.tolist())
-    cameras, times = zip(*((frame.camera, frame.time) for frame in scene.train))
-    source = Source(module, "particles", cameras, [0.0], background, image_times=times)
+    source = source_of(run, module, "particles", [0.0])
     sizes, values = [], []
     with tempfile.TemporaryDirectory() as out:
         for quality in ("compact", "lossless"):

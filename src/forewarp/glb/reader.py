@@ -126,16 +126,14 @@ class Container:
             raise ValueError(f"expected version {VERSION} of glTF, but got {version}")
         if length != len(data):
             raise ValueError(f"expected {length} bytes, as its header says, but got {len(data)}")
-        chunks, begin = {}, 12
-        while begin + 8 <= length:
-            size, kind = struct.unpack_from("<I4s", data, begin)
-            if begin + 8 + size > length:
-                raise ValueError(f"expected a chunk of {size} bytes, but got {length - begin - 8}")
-            chunks.setdefault(kind, memoryview(data)[begin + 8 : begin + 8 + size])
+        chunks, begin = [], 12
+        for wanted in CHUNKS:
+            size, kind = struct.unpack_from("<I4s", data, begin) if begin + 8 <= length else (0, b"")
+            if kind != wanted or begin + 8 + size > length:
+                raise ValueError("expected a whole chunk of JSON and one of arrays, but got others")
+            chunks.append(memoryview(data)[begin + 8 : begin + 8 + size])
             begin += 8 + size
-        text, binary = (chunks.get(kind) for kind in CHUNKS)
-        if text is None or binary is None:
-            raise ValueError("expected a chunk of JSON and one of arrays, but got others")
+        text, binary = chunks
         if len(text) > MOST_CONFIG:
             raise ValueError(f"expected at most {MOST_CONFIG} bytes of JSON, but got {len(text)}")
         self.description, self.binary = Fields(_parsed(bytes(text)), "glTF"), binary
