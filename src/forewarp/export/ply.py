@@ -110,21 +110,20 @@ def packed_columns(columns: Mapping[str, np.ndarray]) -> dict[str, dict[str, np.
     """
     count = len(columns["x"])
     rows = np.minimum(np.arange(-(-count // _CHUNK_ROWS) * _CHUNK_ROWS), count - 1).reshape(-1, _CHUNK_ROWS)
-    chunk, vertex = {}, {}
+    chunk = {}
 
     def packed(values: list[np.ndarray], names: Sequence[str], bits: Sequence[int]) -> np.ndarray:
         """Pack some values (N,), most significant first; those with a name between bounds of their chunk."""
-        word, bounds = np.zeros(count, np.uint32), []
+        word, lows, highs = np.zeros(count, np.uint32), {}, {}
         for value, name, width in zip(values, names, bits):
             if name:
                 table = value[rows]
                 low, high = table.min(1, keepdims=True), table.max(1, keepdims=True)
                 value = ((table - low) / np.where(high > low, high - low, 1)).reshape(-1)[:count]
-                bounds.append((name, low[:, 0], high[:, 0]))
+                lows[f"min_{name}"], highs[f"max_{name}"] = low[:, 0], high[:, 0]
             top = (1 << width) - 1
             word = word << width | np.rint(value * top).clip(0, top).astype(np.uint32)
-        chunk.update((f"min_{name}", low) for name, low, _ in bounds)
-        chunk.update((f"max_{name}", high) for name, _, high in bounds)
+        chunk.update(lows | highs)
         return word
 
     places = [columns[axis] for axis in "xyz"]
@@ -137,16 +136,16 @@ def packed_columns(columns: Mapping[str, np.ndarray]) -> dict[str, dict[str, np.
     quaternions *= np.where(np.take_along_axis(quaternions, largest[:, None], -1) < 0, -1, 1)
     others = np.array([[j for j in range(4) if j != i] for i in range(4)])[largest]  # (N, 3), ascending
     parts = np.take_along_axis(quaternions, others, -1) * math.sqrt(0.5) + 0.5
-    vertex["packed_position"] = packed(places, ("x", "y", "z"), _BITS)
-    vertex["packed_rotation"] = packed([largest / 3, *parts.T], ("",) * 4, (2, 10, 10, 10))
-    vertex["packed_scale"] = packed(scales, ("scale_x", "scale_y", "scale_z"), _BITS)
-    vertex["packed_color"] = packed([*colors, opacity], ("r", "g", "b", ""), (8,) * 4)
-    elements = {"chunk": chunk, "vertex": vertex}
+    vertex = {
+        "packed_position": packed(places, ("x", "y", "z"), _BITS),
+        "packed_rotation": packed([largest / 3, *parts.T], ("",) * 4, (2, 10, 10, 10)),
+        "packed_scale": packed(scales, ("scale_x", "scale_y", "scale_z"), _BITS),
+        "packed_color": packed([*colors, opacity], ("r", "g", "b", ""), (8,) * 4),
+    }
     rest = {name: column for name, column in columns.items() if name.startswith("f_rest_")}
-    if rest:
-        steps = {name: np.floor((column / (2 * _HARMONICS) + 0.5) * 256) for name, column in rest.items()}
-        elements["sh"] = {name: step.clip(0, 255).astype(np.uint8) for name, step in steps.items()}
-    return elements
+    steps = {name: np.floor((column / (2 * _HARMONICS) + 0.5) * 256) for name, column in rest.items()}
+    sh = {name: step.clip(0, 255).astype(np.uint8) for name, step in steps.items()}
+    return {"chunk": chunk, "vertex": vertex} | ({"sh": sh} if sh else {})
 
 
 def header_comments(source: Source, rotation: Tensor) -> list[str]:
