@@ -40,8 +40,8 @@ class Component(NamedTuple):
 
 FLOAT, UINT = Component(5126, "<f4"), Component(5125, "<u4")
 BYTE, SHORT = Component(5121, "<u1"), Component(5123, "<u2")  # both unsigned
-UNIT_BYTE, SIGNED_UNIT_SHORT = BYTE._replace(one=255), Component(5122, "<i2", 32767)
-COMPONENTS = {c.number: c for c in (FLOAT, UINT, BYTE, SHORT, Component(5120, "<i1"), SIGNED_UNIT_SHORT)}
+UNIT_BYTE, SIGNED_SHORT = BYTE._replace(one=255), Component(5122, "<i2", 32767)
+COMPONENTS = {c.number: c for c in (FLOAT, UINT, BYTE, SHORT, Component(5120, "<i1"), SIGNED_SHORT)}
 
 
 class Buffer:
@@ -105,10 +105,16 @@ class Buffer:
         return view
 
     def packed(self, description: dict) -> bytes:
-        """Return the binary container of a description, whose first node holds all, and this buffer."""
+        """Return the binary container of a description, whose first node holds all, and this buffer.
+
+        Args:
+            description: has ``extensionsUsed``, those beside the buffer's own.
+        """
         buffers = [{"byteLength": len(self.content)}]
         if self.compressed:
             buffers.append({"byteLength": self.decoded, "extensions": {COMPRESSION: {"fallback": True}}})
+            used = {"extensionsUsed": [*description["extensionsUsed"], COMPRESSION]}
+            description = description | used | {"extensionsRequired": [COMPRESSION]}
         parts = {"asset": {"version": "2.0", "generator": "forewarp"}, "scene": 0, "scenes": [{"nodes": [0]}]}
         parts |= {"buffers": buffers, "bufferViews": self.views, "accessors": self.accessors}
         text = json.dumps(description | parts, separators=(",", ":")).encode()

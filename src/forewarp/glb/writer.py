@@ -15,16 +15,7 @@ from forewarp.fields.curves import PADDING
 from forewarp.fields.moving import MARGIN, MovingGaussians, NodeMotion
 from forewarp.fields.windows import Window, longest_fade
 from forewarp.glb import meshopt
-from forewarp.glb.container import (
-    BYTE,
-    CAMERA_AXES,
-    COMPRESSION,
-    SHORT,
-    SIGNED_UNIT_SHORT,
-    UNIT_BYTE,
-    Buffer,
-    quaternion_of,
-)
+from forewarp.glb.container import BYTE, CAMERA_AXES, SHORT, SIGNED_SHORT, UNIT_BYTE, Buffer, quaternion_of
 from forewarp.ops.gaussians import LEAST_LOG
 from forewarp.scene.camera import Camera
 
@@ -84,14 +75,8 @@ def write(windows: Sequence[tuple[Window, Rows]], setting: Setting, quality: str
         pose = camera.camera_to_world[:3, :3].double() * CAMERA_AXES
         place = {"rotation": quaternion_of(pose), "translation": camera.center.tolist()}
         nodes.append({"name": f"camera {number}" if number else "start", "camera": number} | place)
-    needed = [COMPRESSION] if store.compressed else []
-    description = {
-        "extensionsUsed": [SPLATS, MOTION, *needed],
-        **({"extensionsRequired": needed} if needed else {}),
-        "nodes": nodes,
-        "cameras": cameras,
-        "meshes": [{"primitives": [primitive]} for primitive in primitives],
-    }
+    meshes = [{"primitives": [primitive]} for primitive in primitives]
+    description = {"extensionsUsed": [SPLATS, MOTION], "nodes": nodes, "cameras": cameras, "meshes": meshes}
     return store.packed(description)
 
 
@@ -204,7 +189,7 @@ class _Store(Buffer):
             return self.add(values, **options)
         elements = meshopt.quaternion(values, bits)
         decoded = meshopt.from_quaternion(elements)
-        return self.add(decoded, SIGNED_UNIT_SHORT, filtered=("QUATERNION", elements), **options)
+        return self.add(decoded, SIGNED_SHORT, filtered=("QUATERNION", elements), **options)
 
     def shares(self, values: np.ndarray, **options) -> int:
         """Store numbers in [0, 1]."""
