@@ -82,14 +82,9 @@ def packed_scene(
     ends = [(window.image_times, *window.span) for window in windows]
     times = [first + time * (last - first) for taken, first, last in ends for time in taken]
     numbers = sorted({0, *spread(len(cameras), _CAMERAS)})
-    setting = Setting(
-        [cameras[number] for number in numbers],
-        source.rotation_to("y"),
-        focus_point(cameras),
-        float(seconds),
-        source.background,
-        [times[number] for number in numbers] if times else [],
-    )
+    shown, taken = [cameras[n] for n in numbers], [times[n] for n in numbers] if times else []
+    rotation, focus = source.rotation_to("y"), focus_point(cameras)
+    setting = Setting(shown, rotation, focus, float(seconds), source.background, taken)
     many = int(shared[0][rows[0].order].sum())
     left_out = sum(len(gaussians.means) for gaussians, *_ in parts) - written - many * len(source.later)
     facts = {"particles": written, "moving": sum(part.in_motion for part in rows), "left out": left_out}

@@ -188,12 +188,8 @@ def export_ply(
         tracks = tracks_of(source, _ALL, progress)
         for file, places in zip(files, tracks.positions @ rotation.T.float()):
             write_ply(file, {"vertex": point_columns(places, tracks.colors[0])}, comments=comments)
-        return {
-            "points": len(tracks),
-            "kind": "points of the surface",
-            "colors": "sRGB, 8 bits, as in the images",
-            "up": up,
-        }
+        facts = {"points": len(tracks), "kind": "points of the surface"}
+        return facts | {"colors": "sRGB, 8 bits, as in the images", "up": up}
     template = source.method.template()
     own_degree = math.isqrt(template.harmonics.shape[1]) - 1
     degree = min(degree, own_degree) if compressed else degree
@@ -209,14 +205,11 @@ def export_ply(
         write_ply(folder / "canonical.ply", {"vertex": splat_columns(template, degree)}, comments=comments)
         motion = {name: value.cpu().numpy() for name, value in source.method.movement(source.times).items()}
         np.savez(folder / "motion.npz", times=np.array(source.times, np.float32), **motion)
-    return {
-        "particles": len(template),
-        "kind": "Gaussian splats" + (", compressed" if compressed else ""),
-        "up": up,
-        "degree": degree,
-        "degree of the run": own_degree,
-        "colors": "sRGB, as in the images: 1/2 + 0.28209479177387814 f_dc is the mean over directions",
-    }
+    kind = "Gaussian splats, compressed" if compressed else "Gaussian splats"
+    facts = {"particles": len(template), "kind": kind, "up": up}
+    facts |= {"degree": degree, "degree of the run": own_degree}
+    colors = "sRGB, as in the images: 1/2 + 0.28209479177387814 f_dc is the mean over directions"
+    return facts | {"colors": colors}
 
 
 _BLUR = 0.5  # spacings of the lattice that Gaussians are blurred by, so that none falls between its points
@@ -359,11 +352,6 @@ def export_mesh(
         vertex_counts.append(len(vertices))
         face_counts.append(len(faces))
         progress(number + 1, len(source.times))
-    return {
-        "vertices": vertex_counts,
-        "faces": face_counts,
-        "level": level,
-        "up": up,
-        "spacing": lattice.spacing[0],
-        "colors": "sRGB, as in the images, the mean over directions",
-    }
+    facts = {"vertices": vertex_counts, "faces": face_counts, "level": level, "up": up}
+    colors = "sRGB, as in the images, the mean over directions"
+    return facts | {"spacing": lattice.spacing[0], "colors": colors}

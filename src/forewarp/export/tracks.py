@@ -194,12 +194,8 @@ def export_npz(source: Source, folder: Path, progress: Progress, *, points: int,
     state = source.method.state_dict().items()
     arrays = {name: value.cpu().numpy() for name, value in state if isinstance(value, Tensor)}
     np.savez_compressed(folder / "method.npz", **arrays)
-    return {
-        "points": len(tracks),
-        "views": len(cameras),
-        "visible": float(visible.float().mean()),
-        "colors": "sRGB, as in the images",
-    }
+    facts = {"points": len(tracks), "views": len(cameras), "visible": float(visible.float().mean())}
+    return facts | {"colors": "sRGB, as in the images"}
 
 
 @torch.no_grad()
@@ -250,13 +246,9 @@ def export_gltf(source: Source, folder: Path, progress: Progress, *, points: int
     tracks = tracks_of(source, points, progress)
     radius = _RADIUS * neighbour_distance(tracks.points, tracks.size)
     (folder / "points.glb").write_bytes(glb(tracks, radius, source.rotation_to("y"), seconds))
-    return {
-        "points": len(tracks),
-        "radius": radius,
-        "seconds": seconds,
-        "axes in the file": "y up, by the turn of its only node; places before it are the data's",
-        "colors": "linear, as glTF asks; unlit",
-    }
+    axes = "y up, by the turn of its only node; places before it are the data's"
+    facts = {"points": len(tracks), "radius": radius, "seconds": seconds, "axes in the file": axes}
+    return facts | {"colors": "linear, as glTF asks; unlit"}
 
 
 def neighbour_distance(points: Tensor, default: float) -> float:

@@ -91,16 +91,11 @@ def export_usd(
             for code, value in zip(codes, values):
                 attribute.Set(value, code)
     stage.Save()
-    return {
-        "particles": len(clouds[0]["positions"]),
-        "degree": degree,
-        "degree of the run": own_degree,
-        "seconds": seconds,
-        "sampled": sampled,
-        "off between times": off_between(source),
-        "axes in the file": f"{axis} up" + ("" if rotation is None else ", turned from the data's world"),
-        "colors": "sRGB, as in the images: 1/2 + 0.28209479177387814 of the first coefficient is the mean",
-    }
+    facts = {"particles": len(clouds[0]["positions"]), "degree": degree, "degree of the run": own_degree}
+    facts |= {"seconds": seconds, "sampled": sampled, "off between times": off_between(source)}
+    turned = "" if rotation is None else ", turned from the data's world"
+    colors = "sRGB, as in the images: 1/2 + 0.28209479177387814 of the first coefficient is the mean"
+    return facts | {"axes in the file": f"{axis} up{turned}", "colors": colors}
 
 
 def upright(source: Source, up: str) -> tuple[str, Tensor | None]:

@@ -118,8 +118,7 @@ class Buffer:
         parts = {"asset": {"version": "2.0", "generator": "forewarp"}, "scene": 0, "scenes": [{"nodes": [0]}]}
         parts |= {"buffers": buffers, "bufferViews": self.views, "accessors": self.accessors}
         text = json.dumps(description | parts, separators=(",", ":")).encode()
-        binary = bytes(self.content)
-        text, binary = text + b" " * (-len(text) % 4), binary + b"\0" * (-len(binary) % 4)
+        text, binary = text + b" " * (-len(text) % 4), bytes(self.content) + bytes(-len(self.content) % 4)
         chunks = zip(CHUNKS, (text, binary))
         body = b"".join(struct.pack("<I4s", len(chunk), kind) + chunk for kind, chunk in chunks)
         return struct.pack("<4sII", MAGIC, VERSION, 12 + len(body)) + body
