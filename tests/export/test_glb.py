@@ -15,6 +15,7 @@ from forewarp.export import glb
 from forewarp.glb.writer import rows_in_file
 from forewarp.scene.view import Moment, View
 from tests.export.conftest import exporter
+from tests.support.gltf import motion_of, unpacked
 
 VALIDATE = """
 const validator = require("gltf-validator"), fs = require("fs");
@@ -43,9 +44,8 @@ def test_particles_are_written_with_what_a_page_needs(particles, tmp_path):
     assert (scene.seconds, len(scene.cameras)) == (3.0, len(particles.cameras))
     first = particles.cameras[0]
     torch.testing.assert_close(scene.cameras[0].camera_to_world, first.camera_to_world)
-    text = file.read_bytes()
-    assert str(tmp_path).encode() not in text
-    description = json.loads(text[20 : 20 + int.from_bytes(text[12:16], "little")])
+    assert str(tmp_path).encode() not in file.read_bytes()
+    description, _ = unpacked(file.read_bytes())
     assert description["extensionsUsed"] == ["KHR_gaussian_splatting", "FOREWARP_gaussian_motion"]
     assert [node["name"] for node in description["nodes"]][:3] == ["scene", "start", "camera 1"]
 
@@ -73,10 +73,7 @@ def test_what_no_training_image_shows_is_left_out_of_compact_files_and_not_misse
 def test_what_images_show_in_motion_comes_first(particles, tmp_path):
     times = np.linspace(0, 1, len(particles.cameras)).tolist()
     about, file = export(replace(particles, image_times=times), tmp_path / "glb", quality="lossless")
-    text = file.read_bytes()
-    description = json.loads(text[20 : 20 + int.from_bytes(text[12:16], "little")])
-    splats = description["meshes"][0]["primitives"][0]["extensions"]["KHR_gaussian_splatting"]
-    motion = splats["extensions"]["FOREWARP_gaussian_motion"]
+    motion = motion_of(unpacked(file.read_bytes())[0])
     frames = [SimpleNamespace(camera=c, time=t) for c, t in zip(particles.cameras, times)]
     wanted = particles.method.moving().means[particles.method.in_motion(frames)]
     assert about["moving"] == motion["inMotion"] == len(wanted) < motion["moving"]

@@ -1,10 +1,8 @@
 """The page that plays a scene: what is in it, and the page in a real browser."""
 
 import base64
-import copy
 import html
 import io
-import json
 import re
 import zlib
 from dataclasses import replace
@@ -29,6 +27,7 @@ from forewarp.scene.view import Moment, View
 from tests.export.conftest import TIMES, exporter
 from tests.glb.test_meshopt import elements
 from tests.support.browser import Tab, chromium, until
+from tests.support.gltf import motion_of, packed, unpacked
 from tests.support.particles import BARE, EVERY, module_with, small_data
 
 export = exporter("html", quality="lossless", seconds=2.0)
@@ -68,9 +67,7 @@ def test_scripts_and_styles_name_parts_that_there_are():
 
 
 def test_a_method_without_particles_is_refused_with_what_it_can_give(ball, tmp_path):
-    with pytest.raises(
-        ValueError, match=r"^format=html: expected .* but got forward; use format=mesh or gltf"
-    ):
+    with pytest.raises(ValueError, match=r"^format=html: expected .* forward; use format=mesh or gltf"):
         export(ball, tmp_path / "html")
     assert list(tmp_path.iterdir()) == []
 
@@ -90,26 +87,40 @@ def browser():
 
 
 @pytest.fixture
-def opened(browser, particles, tmp_path):
-    """``opened(address="", source=None, **options)``: the page in a tab that complains of nothing.
-
-    Without a ``source`` it is that of ``particles``.
-    """
+def tab_of(browser):
+    """``tab_of(**options)``: a tab that complains of nothing."""
     tabs = []
 
-    def open_page(address="", source=None, **options):
-        if source is not None or not tabs:
-            export(source or replace(particles, name=ATTACK), tmp_path / "html")
-        tab = Tab(browser, None, **{"width": 320, "height": 320} | options)
-        tab.page.goto((tmp_path / "html" / "scene.html").as_uri() + address)
-        tab.page.evaluate(SETTLED)
-        tabs.append(tab)
-        return tab
+    def open_tab(**options):
+        tabs.append(Tab(browser, None, **{"width": 320, "height": 320} | options))
+        return tabs[-1]
 
-    yield open_page
+    yield open_tab
     for tab in tabs:
         assert tab.errors == []
         tab.page.close()
+
+
+@pytest.fixture
+def opened(tab_of, particles, tmp_path):
+    """``opened(address="", source=None, **options)``: the page of a source, or that of ``particles``."""
+    written = []
+
+    def open_page(address="", source=None, **options):
+        if source is not None or not written:
+            written.append(export(source or replace(particles, name=ATTACK), tmp_path / "html"))
+        tab = tab_of(**options)
+        go(tab, tmp_path / "html" / "scene.html", address)
+        return tab
+
+    return open_page
+
+
+def go(tab, file, address=""):
+    """Open a page, and wait until it has drawn; also where only its address changes."""
+    tab.page.goto("about:blank")
+    tab.page.goto(file.as_uri() + address)
+    tab.page.evaluate(SETTLED)
 
 
 SETTLED = "forewarp.then((door) => door && door.settled())"
@@ -126,10 +137,10 @@ def state(tab, *names):
     return tab.page.evaluate(f"forewarp.then(({{player}}) => [{', '.join(f'player.{n}' for n in names)}])")
 
 
-def rendered(source, camera, time, background=None):
+def rendered(source, camera, time, method=None):
     """The image (H, W, 3) that the run renders."""
-    background = torch.tensor(source.background if background is None else background)
-    image = source.method.at(Moment(time)).render(View(camera), background)
+    snapshot = (method or source.method).at(Moment(time))
+    image = snapshot.render(View(camera), torch.tensor(source.background))
     return image.rgb.detach().reshape(camera.height, camera.width, 3).clamp(max=1)
 
 
@@ -141,14 +152,10 @@ def drawn(tab, source, **asked):
     return (rgba[..., :3] + (1 - rgba[..., 3:]) * torch.tensor(source.background)).clamp(max=1)
 
 
-def shown(tab):
-    """The image that the tab shows, in [0, 1]."""
-    return torch.from_numpy(iio.imread(io.BytesIO(tab.page.screenshot()))[..., :3].astype(np.float32) / 255)
-
-
-def cameras_of(source):
-    """The cameras of the file: all, where there are so few."""
-    return list(source.cameras)
+def shown(place):
+    """The image that a tab's page, or a part of it, shows, in [0, 1]."""
+    image = iio.imread(io.BytesIO(place.screenshot()))[..., :3]
+    return torch.from_numpy(image.astype(np.float32) / 255)
 
 
 def fitted(camera, width, height):
@@ -161,7 +168,7 @@ def fitted(camera, width, height):
 
 @in_browser
 def test_it_draws_what_the_method_renders(particles, opened):
-    tab, cameras = opened(), cameras_of(particles)
+    tab, cameras = opened(), particles.cameras
     assert state(tab, "renderer.bits", "scene.cameras.length") == [32, len(cameras)]
     for number in range(10):
         time, which = number / 9, number % len(cameras)
@@ -174,11 +181,10 @@ def test_it_draws_what_the_method_renders(particles, opened):
 
 @in_browser
 def test_what_is_shown_follows_the_address(particles, opened):
-    cameras = cameras_of(particles)
     for number, time in ((0, 0.0), (2, 0.5), (3, 1.0)):
         tab = opened(f"?t={time}&controls=0&camera={number}")
-        wanted = rendered(particles, cameras[number].resized(320, 320), time)
-        assert psnr(shown(tab), wanted) > 40
+        wanted = rendered(particles, particles.cameras[number].resized(320, 320), time)
+        assert psnr(shown(tab.page), wanted) > 40
         assert state(tab, "playing", "time", "camera") == [False, time, number]
     tab = opened("?t=0.25&camera=1#t=0.75&layer=resting")
     assert state(tab, "time", "camera", "layer") == [0.75, 1, "resting"]
@@ -204,11 +210,9 @@ def test_layers_are_those_of_the_run(opened):
     tab.page.keyboard.press("v")
     assert tab.page.locator("#layers").is_visible()
     asked = {"width": 100, "height": 100, "time": 0.4, "camera": 1}
-    camera = cameras_of(source)[1].resized(100, 100)
     for layer in LAYERS:
         method = layer_of(module.method, layer, frames)
-        image = method.at(Moment(0.4)).render(View(camera), torch.ones(3)).rgb.detach()
-        wanted = image.reshape(100, 100, 3).clamp(max=1)
+        wanted = rendered(source, source.cameras[1].resized(100, 100), 0.4, method)
         assert psnr(drawn(tab, source, layer=layer, **asked), wanted) > 50
         assert float((1 - wanted).max()) > 0.1
 
@@ -216,7 +220,7 @@ def test_layers_are_those_of_the_run(opened):
 @in_browser
 def test_it_is_played_turned_and_set_by_keys_and_mouse(opened):
     tab = opened("?t=0.5")
-    page, first = tab.page, shown(tab)[60:240, 20:300]
+    page, first = tab.page, shown(tab.page)[60:240, 20:300]
     page.keyboard.press(" ")
     until(lambda: state(tab, "time")[0] != 0.5)
     assert page.get_by_role("button", name="pause").is_visible()
@@ -226,7 +230,7 @@ def test_it_is_played_turned_and_set_by_keys_and_mouse(opened):
     page.keyboard.press(" ")
     page.get_by_label("time", exact=True).fill("0.5")
     page.evaluate(SETTLED)
-    assert psnr(shown(tab)[60:240, 20:300], first) > 45
+    assert psnr(shown(tab.page)[60:240, 20:300], first) > 45
     before = state(tab, "eye")[0]
     page.mouse.move(160, 120)
     page.mouse.down()
@@ -237,12 +241,12 @@ def test_it_is_played_turned_and_set_by_keys_and_mouse(opened):
     for key in ("ArrowLeft", "Shift+ArrowUp", "+", "-", "."):
         page.keyboard.press(key)
     page.evaluate(SETTLED)
-    assert psnr(shown(tab)[60:240, 20:300], first) < 30
+    assert psnr(shown(tab.page)[60:240, 20:300], first) < 30
     page.keyboard.press("h")
     page.keyboard.press(",")
     page.evaluate(SETTLED)
     assert state(tab, "time")[0] == pytest.approx(0.5)
-    assert psnr(shown(tab)[60:240, 20:300], first) > 45
+    assert psnr(shown(tab.page)[60:240, 20:300], first) > 45
     page.get_by_role("button", name="view and playback").click()
     page.get_by_text("moving", exact=True).click()
     page.get_by_text("½").click()
@@ -283,58 +287,47 @@ def test_names_are_not_executed(opened):
         ("delete window.DecompressionStream", "too old"),
     ],
 )
-def test_a_browser_that_cannot_play_it_shows_a_picture_and_says_so(
-    browser, particles, tmp_path, script, says
-):
+def test_a_browser_that_cannot_play_it_shows_a_picture_and_says_so(tab_of, particles, tmp_path, script, says):
     export(particles, tmp_path / "html")
-    tab = Tab(browser, None, width=320, height=320)
+    tab = tab_of()
     tab.page.add_init_script(script)
     tab.page.goto((tmp_path / "html" / "scene.html").as_uri())
     assert tab.page.evaluate("forewarp") is None
     assert says in tab.page.get_by_role("status").inner_text()
     notice = tab.page.locator("#notice").bounding_box()
     seen = to_bytes(poster(particles)).astype(float)
-    picture = to_bytes(shown(tab)).astype(float)
+    picture = to_bytes(shown(tab.page)).astype(float)
     step = len(picture) // len(seen)
     small = picture.reshape(len(seen), step, -1, step, 3).mean((1, 3))
     above = small[: int(notice["y"]) // step], seen[: int(notice["y"]) // step]
     assert len(above[0]) > len(seen) / 2
     assert abs(above[0] - above[1]).mean() < 12
-    assert tab.errors == []
-    tab.page.close()
 
 
 @in_browser
 def test_it_comes_back_after_the_graphics_card_was_taken_away(opened):
     tab = opened("?t=0.5")
-    first = shown(tab)
-    lose = (
-        "forewarp.then(({player}) => (window.card = player.renderer.gl.getExtension('WEBGL_lose_context')))"
-    )
-    tab.page.evaluate(f"{lose}.then(() => card.loseContext())")
+    first = shown(tab.page)
+    card = "(window.card = player.renderer.gl.getExtension('WEBGL_lose_context'))"
+    tab.page.evaluate(f"forewarp.then(({{player}}) => {card}).then(() => card.loseContext())")
     until(lambda: "taken away" in tab.page.locator("#notice").inner_text())
     tab.page.evaluate("card.restoreContext()")
     until(lambda: not tab.page.locator("#notice").is_visible())
     tab.page.evaluate(SETTLED)
-    assert psnr(shown(tab), first) > 60
+    assert psnr(shown(tab.page), first) > 60
     tab.errors[:] = [error for error in tab.errors if "CONTEXT_LOST" not in error]
 
 
 @in_browser
-def test_it_works_inside_another_page(browser, particles, tmp_path, opened):
+def test_it_works_inside_another_page(tab_of, particles, tmp_path):
     file = tmp_path / "outer.html"
     export(particles, tmp_path / "inner")
     file.write_text('<iframe src="inner/scene.html?t=0.5&camera=2&controls=0" width=320 height=320></iframe>')
-    tab = Tab(browser, None, width=400, height=400)
+    tab = tab_of(width=400, height=400)
     tab.page.goto(file.as_uri())
     tab.page.frames[1].evaluate(SETTLED)
-    image = iio.imread(io.BytesIO(tab.page.locator("iframe").screenshot()))[
-        2:-2, 2:-2, :3
-    ]  # without its border
-    wanted = rendered(particles, cameras_of(particles)[2].resized(320, 320), 0.5)
-    assert psnr(torch.from_numpy(image.astype(np.float32) / 255), wanted) > 40
-    assert tab.errors == []
-    tab.page.close()
+    image = shown(tab.page.locator("iframe"))[2:-2, 2:-2]  # without its border
+    assert psnr(image, rendered(particles, particles.cameras[2].resized(320, 320), 0.5)) > 40
 
 
 @in_browser
@@ -388,15 +381,14 @@ def test_each_camera_leaves_out_what_is_too_near_to_it(particles, opened):
     cameras = [first, replace(second, near=10 * away, far=20 * away), *others]
     tab = opened(source=replace(particles, cameras=cameras))
     for number in (0, 1):
-        camera = cameras_of(replace(particles, cameras=cameras))[number].resized(120, 120)
         got = drawn(tab, particles, width=120, height=120, time=0.3, camera=number)
-        assert psnr(got, rendered(particles, camera, 0.3)) > 50
+        assert psnr(got, rendered(particles, cameras[number].resized(120, 120), 0.3)) > 50
     whole = rendered(particles, second.resized(120, 120), 0.3)
     assert psnr(got, whole) < 30
 
 
 @in_browser
-def test_the_page_of_a_run_looks_as_the_run_renders_it(browser, ok, fitted, tmp_path):
+def test_the_page_of_a_run_looks_as_the_run_renders_it(tab_of, ok, fitted, tmp_path):
     data = [f"data.root={fitted.parent}/scenes", "data=dnerf", "data.scene=vehicle", "budget.minutes=null"]
     words = ["budget.iterations=200", "model=particles", "preset=demo", "trainer=cpu", "evaluate=false"]
     ok("train", *data, *words, f"run={tmp_path}/run", "threads=1")
@@ -406,16 +398,11 @@ def test_the_page_of_a_run_looks_as_the_run_renders_it(browser, ok, fitted, tmp_
     run = load(tmp_path / "run")
     train = [frame.camera for frame in run.scene.train]
     cameras = [train[i] for i in sorted({0, *spread(len(train), 12)})]
-    tab = Tab(browser, None, width=train[0].width, height=train[0].height)
+    tab = tab_of(width=train[0].width, height=train[0].height)
     for number in range(10):
         time, which = number / 9, (5 * number) % len(cameras)
-        tab.page.goto("about:blank")
-        tab.page.goto(f"{file.as_uri()}?t={time}&camera={which}&controls=0")
-        tab.page.evaluate(SETTLED)
-        image = run.method.at(Moment(time)).render(View(cameras[which]), torch.ones(3)).rgb.detach()
-        assert psnr(shown(tab), image.reshape(train[0].height, train[0].width, 3).clamp(max=1)) > 50
-    assert tab.errors == []
-    tab.page.close()
+        go(tab, file, f"?t={time}&camera={which}&controls=0")
+        assert psnr(shown(tab.page), run.render(cameras[which], time, "white").rgb) > 50
 
 
 @in_browser
@@ -440,10 +427,10 @@ def test_scenes_of_other_effects_are_drawn_too(opened, effects):
 @in_browser
 def test_trails_follow_what_moves_and_two_fingers_come_nearer(particles, opened):
     tab = opened("?t=0.6&controls=0", has_touch=True)
-    plain = shown(tab)
+    plain = shown(tab.page)
     tab.page.keyboard.press("t")
     tab.page.evaluate(SETTLED)
-    ink = ((shown(tab) - plain).abs().amax(-1) > 0.1).float().mean()
+    ink = ((shown(tab.page) - plain).abs().amax(-1) > 0.1).float().mean()
     assert 0.001 < float(ink) < 0.5
     segments = tab.page.evaluate("forewarp.then(({scene}) => [...trailsOf(scene)])")
     path = torch.tensor(segments).reshape(-1, 12)[:96, :4]  # of the first trail
@@ -470,16 +457,11 @@ def test_trails_follow_what_moves_and_two_fingers_come_nearer(particles, opened)
 @in_browser
 def test_a_broken_scene_is_told_and_the_picture_stays(browser, particles, tmp_path):
     content, _ = packed_scene(particles, "html", quality="compact", seconds=2.0)
-    length = int.from_bytes(content[12:16], "little")
-    told, rest = json.loads(content[20 : 20 + length]), content[20 + length :]
 
     def with_motion(**changes):
-        gltf = copy.deepcopy(told)
-        splats = gltf["meshes"][0]["primitives"][0]["extensions"]["KHR_gaussian_splatting"]["extensions"]
-        splats["FOREWARP_gaussian_motion"] |= changes
-        text = json.dumps(gltf).encode()
-        whole = (len(text) + len(rest) + 20).to_bytes(4, "little")
-        return content[:8] + whole + len(text).to_bytes(4, "little") + content[16:20] + text + rest
+        description, binary = unpacked(content)
+        motion_of(description).update(changes)
+        return packed(description, binary)
 
     file, looks = tmp_path / "scene.html", {"poster": poster(particles), "background": (1.0, 1.0, 1.0)}
     for broken, says in (
@@ -498,18 +480,15 @@ def test_a_broken_scene_is_told_and_the_picture_stays(browser, particles, tmp_pa
 
 
 @in_browser
-def test_the_view_rides_along_with_one_camera_until_somebody_turns_it(browser, particles, tmp_path):
+def test_the_view_rides_along_with_one_camera_until_somebody_turns_it(tab_of, particles, tmp_path):
     first, times = particles.cameras[0], torch.linspace(0, 1, 20, dtype=torch.float64)
     path = orbit(first, torch.zeros(3, dtype=torch.float64), torch.tensor([0.0, 0, 1]).double(), 0.2 * times)
     times = times.tolist()
     source = replace(particles, cameras=path, image_times=times)
     export(source, tmp_path / "html")
-    tab = Tab(browser, None, width=320, height=320)
-    file = (tmp_path / "html" / "scene.html").as_uri()
+    tab, file = tab_of(), tmp_path / "html" / "scene.html"
     for time in (0.0, times[10], 1.0):
-        tab.page.goto("about:blank")
-        tab.page.goto(f"{file}?t={time}&controls=0")
-        tab.page.evaluate(SETTLED)
+        go(tab, file, f"?t={time}&controls=0")
         camera = path[times.index(time)]
         assert state(tab, "riding") == [True]
         np.testing.assert_allclose(state(tab, "eye")[0], camera.center, atol=0.02)
@@ -521,12 +500,8 @@ def test_the_view_rides_along_with_one_camera_until_somebody_turns_it(browser, p
     assert state(tab, "riding", "eye") == [False, eye]
     tab.page.keyboard.press("r")
     assert state(tab, "riding", "eye") != [True, eye]
-    tab.page.goto(f"{file}?t=0.5&camera=3")
+    go(tab, file, "?t=0.5&camera=3")
     assert state(tab, "riding") == [False]
-    assert tab.errors == []
-    tab.page.close()
     export(replace(source, image_times=[(7 * i % 20) / 19 for i in range(20)]), tmp_path / "html")
-    tab = Tab(browser, None)
-    tab.page.goto(file)
+    go(tab, file)
     assert state(tab, "riding", "path") == [False, None]  # of many cameras, or one that jumps
-    tab.page.close()

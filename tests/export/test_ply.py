@@ -220,9 +220,7 @@ def test_headers_say_which_axis_is_vertical(particles, tmp_path, up, axis):
 
 
 def test_voxels_are_not_compressed(ball, tmp_path):
-    with pytest.raises(
-        ValueError, match="compressed: expected a run of particles, .* but got one of forward"
-    ):
+    with pytest.raises(ValueError, match="compressed: expected a run of particles, but got one of forward"):
         export(ball, tmp_path / "ply", compressed=True)
     assert list(tmp_path.iterdir()) == []
 

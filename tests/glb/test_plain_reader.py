@@ -1,8 +1,5 @@
 """docs/format.md suffices: a reader that follows it alone draws what forewarp draws."""
 
-import json
-import struct
-
 import numpy as np
 import pytest
 import torch
@@ -11,6 +8,7 @@ from forewarp import load
 from forewarp.synth.scenes import synthesize
 from tests.glb.plain_reader import DTYPES, MOTION, SPLATS, PlainScene, sixteen
 from tests.support.commands import SCENE
+from tests.support.gltf import packed
 
 TIMES = (0.0, 0.37, 1.0)
 TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
@@ -141,8 +139,5 @@ def write_scene(path, curve, without, seed=0):
     views = [{"camera": i, "translation": [0.1 * z, 0.2 * z, z]} | turn for i, z in places]
     mesh = {"mesh": 0, "rotation": [0.5, 0.5, 0.5, 0.5], "children": [*range(1, len(views) + 1)]}
     document["nodes"], document["buffers"] = [mesh, *views], [{"byteLength": len(blob)}]
-    text = json.dumps(document).encode()
-    text += b" " * (-len(text) % 4)
-    head = struct.pack("<4sIII4s", b"glTF", 2, 28 + len(text) + len(blob), len(text), b"JSON")
-    path.write_bytes(head + text + struct.pack("<I4s", len(blob), b"BIN\0") + blob)
+    path.write_bytes(packed(document, bytes(blob)))
     return path

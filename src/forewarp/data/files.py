@@ -8,6 +8,7 @@ import json
 import operator
 import os
 import re
+import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
@@ -117,11 +118,9 @@ def number(value: object, where: str, low: float = -inf, high: float = inf) -> f
     >>> number(1, "a.json: time", 0, 1)
     1.0
     """
-    try:
-        is_number = isinstance(value, (int, float)) and not isinstance(value, bool) and isfinite(value)
-    except OverflowError:  # an integer beyond every float
-        is_number = False
-    if not is_number or not low <= value <= high:
+    is_real = isinstance(value, int | float) and not isinstance(value, bool)
+    # An integer may be beyond every float.
+    if not (is_real and abs(value) <= sys.float_info.max and low <= value <= high):
         within = "" if (low, high) == (-inf, inf) else f" in [{low:g}, {high:g}]"
         raise mismatch(where, f"a number{within}", short(value))
     return float(value)

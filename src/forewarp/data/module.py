@@ -19,6 +19,7 @@ from forewarp.data.files import RECORD, fingerprint, mismatch, one_of, whole
 from forewarp.data.films import STORE, films_of
 from forewarp.data.images import CACHE
 from forewarp.data.windows import cut
+from forewarp.ops.backend import is_number
 from forewarp.scene.frame import Scene, Truth, middle_of, spread
 from forewarp.scene.view import Target
 
@@ -90,7 +91,7 @@ def with_canonical(scene: Scene, canonical: str | float | None) -> Scene:
     """
     if canonical is None:
         return scene
-    is_time = isinstance(canonical, int | float) and not isinstance(canonical, bool) and 0 <= canonical <= 1
+    is_time = is_number(canonical) and 0 <= canonical <= 1
     if canonical not in ("first", "middle", "spread") and not is_time:
         raise mismatch("data.canonical", "first, middle, spread, a time in [0, 1] or null", repr(canonical))
     if is_time:

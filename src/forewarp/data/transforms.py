@@ -23,6 +23,7 @@ import torch
 from forewarp.data.cameras import FLIP, check_lens, check_middle, pose_of
 from forewarp.data.files import Entry, frames_of, mismatch, nearly, one_of
 from forewarp.data.images import SUFFIXES, TURN, Header, by, exif_turned, in_order, inspect_image, name_parts
+from forewarp.ops.backend import is_number
 from forewarp.scene.camera import Camera, Lens
 
 Thing = TypeVar("Thing")
@@ -282,7 +283,7 @@ def left_aside(cameras: Iterable[tuple[Entry, Camera]]) -> list[str]:
             continue
         angle = 2 * math.atan(0.5 * camera.height / camera.fy)
         got = f"{short(told)}, no radians inside (0, pi),"
-        if isinstance(told, (int, float)) and not isinstance(told, bool) and 0 < told < math.pi:
+        if is_number(told) and 0 < told < math.pi:
             if abs(math.tan(0.5 * told) / math.tan(0.5 * angle) - 1) <= _SAME_FOCAL:
                 continue
             got = f"{math.degrees(told):.1f} degrees"

@@ -106,13 +106,13 @@ def write(
     require(kind)
     export = getattr(import_module(f"forewarp.export.{FORMATS[kind].module}"), f"export_{kind}")
     with folder_written_whole(folder, ABOUT) as part:
-        if kind not in ("mesh", "glb", "usd", "html"):  # which ask for matter alone, and for particles
-            source.check_tracks(kind)
+        if kind in ("ply", "gltf", "npz") and not source.follows:
+            expected = "a method whose points can be followed, as particles, forward or backward"
+            raise ValueError(f"format={kind}: expected {expected}, but got {source.model}")
         facts = export(source, part, progress, **options)
         files = sorted(file for file in part.rglob("*") if file.is_file())
         sizes = {file.relative_to(part).as_posix(): file.stat().st_size for file in files}
         times = {"times": list(source.times)} if FORMATS[kind].times else {}
-        head = {"format": kind, **about, **times, "axes": _AXES}
-        content = head | facts | {"bytes": sizes}
+        content = {"format": kind, **about, **times, "axes": _AXES, **facts, "bytes": sizes}
         write_json(part / ABOUT, content)
     return content

@@ -60,7 +60,7 @@ def poster(source: Source) -> Tensor:
     """Render what the page begins with: the first camera's image (H, W, 3) at time 0."""
     camera = source.cameras[0]
     image = source.method.at(Moment(0.0)).render(View(camera), torch.tensor(source.background))
-    return image.rgb.reshape(camera.height, camera.width, 3).cpu()
+    return image.shaped(camera.height, camera.width).rgb
 
 
 def page(content: bytes, *, title: str, poster: Tensor, background: tuple[float, float, float]) -> str:
@@ -96,17 +96,13 @@ def _scripts() -> tuple[str, str]:
 
 def script_digests() -> list[str]:
     """Return how a policy names the page's scripts: what encloses the page must allow them, too."""
-    return list(map(_digest, _scripts()))
+    # Between its tags a script stands on lines of its own.
+    digests = [hashlib.sha256(f"\n{script}\n".encode()).digest() for script in _scripts()]
+    return [f"'sha256-{_base64(digest)}'" for digest in digests]
 
 
 def _source(name: str) -> str:
     return (_PLAYER / name).read_text(encoding="utf-8")
-
-
-def _digest(script: str) -> str:
-    """Return how a policy names a script that stands between its tags on lines of its own."""
-    digest = hashlib.sha256(f"\n{script}\n".encode()).digest()
-    return f"'sha256-{_base64(digest)}'"
 
 
 def _base64(content: bytes) -> str:

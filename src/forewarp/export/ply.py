@@ -110,21 +110,20 @@ def packed_columns(columns: Mapping[str, np.ndarray]) -> dict[str, dict[str, np.
     """
     count = len(columns["x"])
     rows = np.minimum(np.arange(-(-count // _CHUNK_ROWS) * _CHUNK_ROWS), count - 1).reshape(-1, _CHUNK_ROWS)
-    chunk, vertex = {}, {}
+    chunk = {}
 
     def packed(values: list[np.ndarray], names: Sequence[str], bits: Sequence[int]) -> np.ndarray:
         """Pack some values (N,), most significant first; those with a name between bounds of their chunk."""
-        word, bounds = np.zeros(count, np.uint32), []
+        word, lows, highs = np.zeros(count, np.uint32), {}, {}
         for value, name, width in zip(values, names, bits):
             if name:
                 table = value[rows]
                 low, high = table.min(1, keepdims=True), table.max(1, keepdims=True)
                 value = ((table - low) / np.where(high > low, high - low, 1)).reshape(-1)[:count]
-                bounds.append((name, low[:, 0], high[:, 0]))
+                lows[f"min_{name}"], highs[f"max_{name}"] = low[:, 0], high[:, 0]
             top = (1 << width) - 1
             word = word << width | np.rint(value * top).clip(0, top).astype(np.uint32)
-        chunk.update((f"min_{name}", low) for name, low, _ in bounds)
-        chunk.update((f"max_{name}", high) for name, _, high in bounds)
+        chunk.update(lows | highs)
         return word
 
     places = [columns[axis] for axis in "xyz"]
@@ -137,23 +136,23 @@ def packed_columns(columns: Mapping[str, np.ndarray]) -> dict[str, dict[str, np.
     quaternions *= np.where(np.take_along_axis(quaternions, largest[:, None], -1) < 0, -1, 1)
     others = np.array([[j for j in range(4) if j != i] for i in range(4)])[largest]  # (N, 3), ascending
     parts = np.take_along_axis(quaternions, others, -1) * math.sqrt(0.5) + 0.5
-    vertex["packed_position"] = packed(places, ("x", "y", "z"), _BITS)
-    vertex["packed_rotation"] = packed([largest / 3, *parts.T], ("",) * 4, (2, 10, 10, 10))
-    vertex["packed_scale"] = packed(scales, ("scale_x", "scale_y", "scale_z"), _BITS)
-    vertex["packed_color"] = packed([*colors, opacity], ("r", "g", "b", ""), (8,) * 4)
-    elements = {"chunk": chunk, "vertex": vertex}
+    vertex = {
+        "packed_position": packed(places, ("x", "y", "z"), _BITS),
+        "packed_rotation": packed([largest / 3, *parts.T], ("",) * 4, (2, 10, 10, 10)),
+        "packed_scale": packed(scales, ("scale_x", "scale_y", "scale_z"), _BITS),
+        "packed_color": packed([*colors, opacity], ("r", "g", "b", ""), (8,) * 4),
+    }
     rest = {name: column for name, column in columns.items() if name.startswith("f_rest_")}
-    if rest:
-        steps = {name: np.floor((column / (2 * _HARMONICS) + 0.5) * 256) for name, column in rest.items()}
-        elements["sh"] = {name: step.clip(0, 255).astype(np.uint8) for name, step in steps.items()}
-    return elements
+    steps = {name: np.floor((column / (2 * _HARMONICS) + 0.5) * 256) for name, column in rest.items()}
+    sh = {name: step.clip(0, 255).astype(np.uint8) for name, step in steps.items()}
+    return {"chunk": chunk, "vertex": vertex} | ({"sh": sh} if sh else {})
 
 
 def header_comments(source: Source, rotation: Tensor) -> list[str]:
     """Return what viewers read in a header: ``Vertical axis: z``, as nerfstudio and Brush write it, where the
     images' mean upward direction, after a rotation (3, 3), is along an axis or against it; else nothing.
     """
-    upwards = (rotation @ mean_up(list(source.cameras)).double()).abs()
+    upwards = (rotation @ mean_up(source.cameras)).abs()
     return [f"Vertical axis: {'xyz'[int(upwards.argmax())]}"] if float(upwards.max()) > ALONG else []
 
 
@@ -179,10 +178,8 @@ def export_ply(
     """
     rotation, total = source.rotation_to(up), len(source.times)
     if compressed and not source.has_ellipsoids:
-        raise ValueError(
-            f"compressed: expected a run of particles, as it is a format of theirs, but got one of "
-            f"{source.model}; leave it out"
-        )
+        got = f"one of {source.model}"
+        raise ValueError(f"compressed: expected a run of particles, but got {got}; leave it out")
     (folder / "frames").mkdir()
     suffix = ".compressed.ply" if compressed else ".ply"
     files = [folder / "frames" / f"frame_{number:04d}{suffix}" for number in range(total)]
@@ -191,12 +188,8 @@ def export_ply(
         tracks = tracks_of(source, _ALL, progress)
         for file, places in zip(files, tracks.positions @ rotation.T.float()):
             write_ply(file, {"vertex": point_columns(places, tracks.colors[0])}, comments=comments)
-        return {
-            "points": len(tracks),
-            "kind": "points of the surface",
-            "colors": "sRGB, 8 bits, as in the images",
-            "up": up,
-        }
+        facts = {"points": len(tracks), "kind": "points of the surface"}
+        return facts | {"colors": "sRGB, 8 bits, as in the images", "up": up}
     template = source.method.template()
     own_degree = math.isqrt(template.harmonics.shape[1]) - 1
     degree = min(degree, own_degree) if compressed else degree
@@ -212,14 +205,11 @@ def export_ply(
         write_ply(folder / "canonical.ply", {"vertex": splat_columns(template, degree)}, comments=comments)
         motion = {name: value.cpu().numpy() for name, value in source.method.movement(source.times).items()}
         np.savez(folder / "motion.npz", times=np.array(source.times, np.float32), **motion)
-    return {
-        "particles": len(template),
-        "kind": "Gaussian splats" + (", compressed" if compressed else ""),
-        "up": up,
-        "degree": degree,
-        "degree of the run": own_degree,
-        "colors": "sRGB, as in the images: 1/2 + 0.28209479177387814 f_dc is the mean over directions",
-    }
+    kind = "Gaussian splats, compressed" if compressed else "Gaussian splats"
+    facts = {"particles": len(template), "kind": kind, "up": up}
+    facts |= {"degree": degree, "degree of the run": own_degree}
+    colors = "sRGB, as in the images: 1/2 + 0.28209479177387814 f_dc is the mean over directions"
+    return facts | {"colors": colors}
 
 
 _BLUR = 0.5  # spacings of the lattice that Gaussians are blurred by, so that none falls between its points
@@ -362,11 +352,6 @@ def export_mesh(
         vertex_counts.append(len(vertices))
         face_counts.append(len(faces))
         progress(number + 1, len(source.times))
-    return {
-        "vertices": vertex_counts,
-        "faces": face_counts,
-        "level": level,
-        "up": up,
-        "spacing": lattice.spacing[0],
-        "colors": "sRGB, as in the images, the mean over directions",
-    }
+    facts = {"vertices": vertex_counts, "faces": face_counts, "level": level, "up": up}
+    colors = "sRGB, as in the images, the mean over directions"
+    return facts | {"spacing": lattice.spacing[0], "colors": colors}

@@ -17,8 +17,8 @@ from torch import Tensor
 from forewarp.drawing.images import hidden
 from forewarp.evaluation.images import within
 from forewarp.evaluation.trajectories import seen_by, surface
-from forewarp.glb.container import UINT, Buffer
-from forewarp.methods.method import HasEllipsoids, HasMatter, HasTrajectories, Method
+from forewarp.glb.container import UINT, Buffer, quaternion_of
+from forewarp.methods.method import HasBounds, HasEllipsoids, HasMatter, HasTrajectories, Method
 from forewarp.scene.camera import Camera, mean_up
 from forewarp.scene.cloud import far_apart
 from forewarp.scene.frame import spread
@@ -76,8 +76,8 @@ class Source:
 
         if up == "world":
             return torch.eye(3, dtype=torch.float64)
-        before = mean_up(list(self.cameras)).numpy()
-        return torch.from_numpy(Rotation.align_vectors([_UP[up]], [before])[0].as_matrix())
+        rotation, _ = Rotation.align_vectors([_UP[up]], [mean_up(self.cameras).numpy()])
+        return torch.from_numpy(rotation.as_matrix())
 
     @property
     def follows(self) -> bool:
@@ -85,17 +85,12 @@ class Source:
         points = isinstance(self.method, HasTrajectories) and isinstance(self.method, HasMatter)
         return self.has_ellipsoids or points
 
-    def check_tracks(self, kind: str) -> None:
-        """Refuse a method that ``tracks_of`` cannot follow.
-
-        Raises:
-            ValueError: naming the format ``kind``.
-        """
-        if not self.follows:
-            raise ValueError(
-                f"format={kind}: expected a method whose points can be followed, as particles, forward or "
-                f"backward, but got {self.model}"
-            )
+    def without_particles(self, kind: str) -> ValueError:
+        """Return the refusal of a format that asks for particles, naming those that there are."""
+        others = ["mesh"] if isinstance(self.method, HasBounds) else []
+        others += ["gltf", "ply", "npz"] if self.follows else []
+        got = self.model + (f"; use format={' or '.join(others)}" if others else "")
+        return ValueError(f"format={kind}: expected a method made of particles, but got {got}")
 
 
 @dataclass(frozen=True)
@@ -199,12 +194,8 @@ def export_npz(source: Source, folder: Path, progress: Progress, *, points: int,
     state = source.method.state_dict().items()
     arrays = {name: value.cpu().numpy() for name, value in state if isinstance(value, Tensor)}
     np.savez_compressed(folder / "method.npz", **arrays)
-    return {
-        "points": len(tracks),
-        "views": len(cameras),
-        "visible": float(visible.float().mean()),
-        "colors": "sRGB, as in the images",
-    }
+    facts = {"points": len(tracks), "views": len(cameras), "visible": float(visible.float().mean())}
+    return facts | {"colors": "sRGB, as in the images"}
 
 
 @torch.no_grad()
@@ -255,13 +246,9 @@ def export_gltf(source: Source, folder: Path, progress: Progress, *, points: int
     tracks = tracks_of(source, points, progress)
     radius = _RADIUS * neighbour_distance(tracks.points, tracks.size)
     (folder / "points.glb").write_bytes(glb(tracks, radius, source.rotation_to("y"), seconds))
-    return {
-        "points": len(tracks),
-        "radius": radius,
-        "seconds": seconds,
-        "axes in the file": "y up, by the turn of its only node; places before it are the data's",
-        "colors": "linear, as glTF asks; unlit",
-    }
+    axes = "y up, by the turn of its only node; places before it are the data's"
+    facts = {"points": len(tracks), "radius": radius, "seconds": seconds, "axes in the file": axes}
+    return facts | {"colors": "linear, as glTF asks; unlit"}
 
 
 def neighbour_distance(points: Tensor, default: float) -> float:
@@ -292,8 +279,6 @@ def glb(tracks: Tracks, radius: float, rotation: Tensor, seconds: float) -> byte
         rotation: (3, 3) of the scene's only node.
         seconds: duration of the animation from time 0 to time 1.
     """
-    from scipy.spatial.transform import Rotation
-
     total = len(tracks.times)
     opacity = tracks.opacity / tracks.opacity.amax(0).clamp(min=1e-6)
     scale = radius * opacity.expand(total, -1)[..., None, None]
@@ -318,14 +303,10 @@ def glb(tracks: Tracks, radius: float, rotation: Tensor, seconds: float) -> byte
         sampler = {"input": clock, "output": weights, "interpolation": "LINEAR"}
         channel = {"sampler": 0, "target": {"node": 0, "path": "weights"}}
         animation = {"animations": [{"name": "time", "samplers": [sampler], "channels": [channel]}]}
-    quaternion = Rotation.from_matrix(rotation.numpy()).as_quat().tolist()  # x, y, z, w
     unlit = {"extensions": {"KHR_materials_unlit": {}}, "pbrMetallicRoughness": {"metallicFactor": 0}}
     description = {
-        "asset": {"version": "2.0", "generator": "forewarp"},
         "extensionsUsed": ["KHR_materials_unlit"],
-        "scene": 0,
-        "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0, "rotation": quaternion, "name": "points"}],
+        "nodes": [{"mesh": 0, "rotation": quaternion_of(rotation), "name": "points"}],
         "meshes": [mesh],
         "materials": [unlit],
     }

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +17,6 @@ from forewarp.scene.cloud import Ellipsoids
 
 _FPS = 24.0  # time codes a second, OpenUSD's own default
 _REACH = 3.0  # standard deviations that the extent holds
-_UP_AXES = {"y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 
 
 def export_usd(
@@ -43,9 +43,7 @@ def export_usd(
     from pxr import Gf, Usd, UsdGeom, UsdVol, Vt
 
     if not source.has_ellipsoids:
-        raise ValueError(
-            f"format=usd: expected a method made of particles, but got {source.model}; use another format"
-        )
+        raise source.without_particles("usd")
     if not hasattr(UsdVol, "ParticleField3DGaussianSplat"):
         version = ".".join(map(str, Usd.GetVersion()[1:]))
         raise ValueError(f"format=usd: expected OpenUSD 26.03 or later, but got {version}; update usd-core")
@@ -74,8 +72,8 @@ def export_usd(
     field.CreateRadianceSphericalHarmonicsDegreeAttr(degree)
     field.CreateSortingModeHintAttr("cameraDistance")
     reach = _REACH * max(float(cloud["scales"].max()) for cloud in clouds)
-    corners = [cloud["positions"] for cloud in clouds]
-    low, high = np.min([c.min(0) for c in corners], 0) - reach, np.max([c.max(0) for c in corners], 0) + reach
+    places = np.stack([cloud["positions"] for cloud in clouds])
+    low, high = places.min((0, 1)) - reach, places.max((0, 1)) + reach
     field.CreateExtentAttr(Vt.Vec3fArray([Gf.Vec3f(*low.tolist()), Gf.Vec3f(*high.tolist())]))
     attributes = {
         "positions": (field.CreatePositionsAttr(), Vt.Vec3fArray),
@@ -93,16 +91,11 @@ def export_usd(
             for code, value in zip(codes, values):
                 attribute.Set(value, code)
     stage.Save()
-    return {
-        "particles": len(clouds[0]["positions"]),
-        "degree": degree,
-        "degree of the run": own_degree,
-        "seconds": seconds,
-        "sampled": sampled,
-        "off between times": off_between(source),
-        "axes in the file": f"{axis} up" + ("" if rotation is None else ", turned from the data's world"),
-        "colors": "sRGB, as in the images: 1/2 + 0.28209479177387814 of the first coefficient is the mean",
-    }
+    facts = {"particles": len(clouds[0]["positions"]), "degree": degree, "degree of the run": own_degree}
+    facts |= {"seconds": seconds, "sampled": sampled, "off between times": off_between(source)}
+    turned = "" if rotation is None else ", turned from the data's world"
+    colors = "sRGB, as in the images: 1/2 + 0.28209479177387814 of the first coefficient is the mean"
+    return facts | {"axes in the file": f"{axis} up{turned}", "colors": colors}
 
 
 def upright(source: Source, up: str) -> tuple[str, Tensor | None]:
@@ -112,15 +105,14 @@ def upright(source: Source, up: str) -> tuple[str, Tensor | None]:
     Raises:
         ValueError: for an axis that OpenUSD has not.
     """
-    if up not in ("world", *_UP_AXES):
+    if up not in ("world", "y", "z"):
         raise ValueError(f"up: expected world, y or z with format=usd, but got {up}")
-    if up != "world":
-        return up, source.rotation_to(up)
-    upwards = mean_up(list(source.cameras)).double()
-    for axis, direction in _UP_AXES.items():
-        if float(upwards @ torch.tensor(direction, dtype=torch.float64)) > ALONG:
-            return axis, None
-    return "z", source.rotation_to("z")
+    if up == "world":
+        for axis, along in zip("yz", mean_up(source.cameras)[1:]):
+            if along > ALONG:
+                return axis, None
+        up = "z"
+    return up, source.rotation_to(up)
 
 
 def samples(cloud: Ellipsoids, rotation: Tensor | None, degree: int) -> dict[str, np.ndarray]:
@@ -137,11 +129,10 @@ def off_between(source: Source) -> dict[str, float]:
     """Measure how far a straight way between samples leads from the run's own, halfway between two times:
     world units, the largest distance and that which 99 % of the particles stay below.
     """
-    times, method = list(source.times), source.method
+    centers = [source.method.ellipsoids(time).centers for time in source.times]
     away = [torch.zeros(1)]
-    for before, after in zip(times, times[1:]):
-        ends = [method.ellipsoids(time).centers for time in (before, after)]
-        middle = method.ellipsoids((before + after) / 2).centers
-        away.append((middle - (ends[0] + ends[1]) / 2).norm(dim=-1).cpu())
+    for times, ends in zip(pairwise(source.times), pairwise(centers)):
+        middle = source.method.ellipsoids(sum(times) / 2).centers
+        away.append((middle - sum(ends) / 2).norm(dim=-1).cpu())
     distances = torch.cat(away)
     return {"largest": float(distances.max()), "99 %": float(distances.quantile(0.99))}

@@ -126,7 +126,7 @@ def with_shared(own: MovingGaussians, still: MovingGaussians) -> MovingGaussians
     return replace(own, **parts, motion=motion)
 
 
-def taken(gaussians: MovingGaussians, rows: Tensor) -> MovingGaussians:
+def taken(gaussians: MovingGaussians, rows: Tensor | slice) -> MovingGaussians:
     """Return some rows of Gaussians, which follow no nodes."""
     names = [name for name in ROWS if getattr(gaussians, name) is not None]
     return replace(gaussians, **{name: getattr(gaussians, name)[rows] for name in names}, motion=None)

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import json
 import struct
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from forewarp.glb import meshopt
@@ -16,6 +18,14 @@ MAGIC, VERSION = b"glTF", 2
 CHUNKS = b"JSON", b"BIN\0"
 ELEMENTS = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
 _VERTICES = 34962  # glTF's target of views of vertex attributes
+CAMERA_AXES = torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64)  # ours by glTF's, and the other way round
+
+
+def quaternion_of(rotation: Tensor) -> list[float]:
+    """Return a rotation (3, 3) float64 as a node of glTF has it: x, y, z, w."""
+    from scipy.spatial.transform import Rotation  # late, as its import takes time
+
+    return Rotation.from_matrix(rotation.numpy()).as_quat().tolist()
 
 
 class Component(NamedTuple):
@@ -30,9 +40,8 @@ class Component(NamedTuple):
 
 FLOAT, UINT = Component(5126, "<f4"), Component(5125, "<u4")
 BYTE, SHORT = Component(5121, "<u1"), Component(5123, "<u2")  # both unsigned
-UNIT_BYTE, UNIT_SHORT = BYTE._replace(one=255), SHORT._replace(one=65535)
-SIGNED_UNIT_SHORT = Component(5122, "<i2", 32767)
-COMPONENTS = {c.number: c for c in (FLOAT, UINT, BYTE, SHORT, Component(5120, "<i1"), SIGNED_UNIT_SHORT)}
+UNIT_BYTE, SIGNED_SHORT = BYTE._replace(one=255), Component(5122, "<i2", 32767)
+COMPONENTS = {c.number: c for c in (FLOAT, UINT, BYTE, SHORT, Component(5120, "<i1"), SIGNED_SHORT)}
 
 
 class Buffer:
@@ -48,7 +57,7 @@ class Buffer:
 
     def add(
         self,
-        values: Tensor | np.ndarray,
+        values: Tensor | np.ndarray | Sequence[float],
         component: Component = FLOAT,
         *,
         bounds: bool = False,
@@ -96,14 +105,20 @@ class Buffer:
         return view
 
     def packed(self, description: dict) -> bytes:
-        """Return the binary container of a description and this buffer."""
+        """Return the binary container of a description, whose first node holds all, and this buffer.
+
+        Args:
+            description: has ``extensionsUsed``, those beside the buffer's own.
+        """
         buffers = [{"byteLength": len(self.content)}]
         if self.compressed:
             buffers.append({"byteLength": self.decoded, "extensions": {COMPRESSION: {"fallback": True}}})
-        parts = {"buffers": buffers, "bufferViews": self.views, "accessors": self.accessors}
+            used = {"extensionsUsed": [*description["extensionsUsed"], COMPRESSION]}
+            description = description | used | {"extensionsRequired": [COMPRESSION]}
+        parts = {"asset": {"version": "2.0", "generator": "forewarp"}, "scene": 0, "scenes": [{"nodes": [0]}]}
+        parts |= {"buffers": buffers, "bufferViews": self.views, "accessors": self.accessors}
         text = json.dumps(description | parts, separators=(",", ":")).encode()
-        binary = bytes(self.content)
-        text, binary = text + b" " * (-len(text) % 4), binary + b"\0" * (-len(binary) % 4)
+        text, binary = text + b" " * (-len(text) % 4), bytes(self.content) + bytes(-len(self.content) % 4)
         chunks = zip(CHUNKS, (text, binary))
         body = b"".join(struct.pack("<I4s", len(chunk), kind) + chunk for kind, chunk in chunks)
         return struct.pack("<4sII", MAGIC, VERSION, 12 + len(body)) + body

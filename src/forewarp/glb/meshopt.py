@@ -12,7 +12,10 @@ import numpy as np
 
 _HEADER, _TAIL = 0xA0, 32  # first byte; bytes of the tail, at least
 _GROUP, _MOST_GROUPS, _BLOCK_BYTES = 16, 16, 8192
-_BITS = (0, 2, 4, 8)  # of a difference, by the mode of its group
+# A group has a mode from 0 to 3: no difference, or differences of 2, 4 or 8 bits each. Of 2 and 4 bits: the
+# mode, the bits, and the code that says that the difference is a byte behind the group.
+_PACKED = (1, 2, 3), (2, 4, 15)
+_MOST_GROUP_BYTES = 24
 # Exponents that the exponential filter takes.
 LEAST_EXPONENT, MOST_EXPONENT = -100, 100
 
@@ -22,11 +25,6 @@ def _block_elements(stride: int) -> int:
     return min(_BLOCK_BYTES // stride & ~(_GROUP - 1), _MOST_GROUPS * _GROUP)
 
 
-def _zigzag(differences: np.ndarray) -> np.ndarray:
-    signed = differences.view(np.int8)
-    return ((signed << 1) ^ (signed >> 7)).view(np.uint8)
-
-
 def encode(elements: np.ndarray) -> bytes:
     """Compress elements (N, stride) uint8; the stride is a multiple of 4, at most 256.
 
@@ -34,7 +32,8 @@ def encode(elements: np.ndarray) -> bytes:
     """
     count, stride = elements.shape
     baseline = elements[:1] if count else np.zeros((1, stride), np.uint8)
-    zigzag = _zigzag(np.diff(elements, axis=0, prepend=baseline))
+    differences = np.diff(elements, axis=0, prepend=baseline).view(np.int8)
+    zigzag = ((differences << 1) ^ (differences >> 7)).view(np.uint8)
     size, parts = _block_elements(stride), [bytes([_HEADER])]
     whole = count // size * size
     for rows, elements_each in ((zigzag[:whole], size), (zigzag[whole:], count - whole)):
@@ -43,51 +42,46 @@ def encode(elements: np.ndarray) -> bytes:
             padded = np.zeros((len(rows) // elements_each, groups * _GROUP, stride), np.uint8)
             padded[:, :elements_each] = rows.reshape(-1, elements_each, stride)
             parts.append(_blocks(padded.transpose(0, 2, 1).reshape(-1, groups, _GROUP)))
-    tail = baseline.tobytes()
-    return b"".join([*parts, bytes(max(_TAIL - stride, 0)), tail])
+    return b"".join([*parts, bytes(max(_TAIL - stride, 0)), baseline.tobytes()])
 
 
 def _blocks(values: np.ndarray) -> bytes:
     """Pack data blocks: values (D, G, 16), G groups in each of D."""
     blocks, groups, _ = values.shape
-    escapes = [values >= 3, values >= 15]
+    escapes = [values >= escape for _, _, escape in _PACKED]
     sizes = [np.where(values.any(-1), 255, 0)]
-    sizes += [b // 8 * _GROUP + (b % 8 * _GROUP) // 8 + e.sum(-1) for b, e in zip(_BITS[1:3], escapes)]
+    sizes += [2 * bits + escaped.sum(-1) for (_, bits, _), escaped in zip(_PACKED, escapes)]
     sizes.append(np.full((blocks, groups), _GROUP))
     modes = np.argmin(np.stack(sizes), 0)  # the smallest, of equal ones that with fewer bits
     lengths = np.choose(modes, sizes)
-    # Each group in the first ``lengths`` of 24 bytes.
-    packed = np.zeros((blocks, groups, 24), np.uint8)
+    packed = np.zeros((blocks, groups, _MOST_GROUP_BYTES), np.uint8)  # each group in the first ``lengths``
     packed[modes == 3, :_GROUP] = values[modes == 3]
-    for mode, most in ((1, 3), (2, 15)):
+    for (mode, bits, escape), escaped in zip(_PACKED, escapes):
         chosen = modes == mode
-        rows, bits, escaped = values[chosen], _BITS[mode], escapes[mode - 1][chosen]
-        each = 8 // bits
-        head = _GROUP // each
-        codes = np.minimum(rows, most).reshape(len(rows), head, each)
-        shifts = (bits * np.arange(each - 1, -1, -1)).astype(np.uint8)
-        room = np.zeros((len(rows), 24), np.uint8)
-        room[:, :head] = (codes << shifts).sum(-1, dtype=np.uint8)
+        rows, escaped, head = values[chosen], escaped[chosen], 2 * bits
+        codes = np.minimum(rows, escape).reshape(len(rows), head, 8 // bits)
+        room = np.zeros((len(rows), _MOST_GROUP_BYTES), np.uint8)
+        room[:, :head] = (codes << _shifts(bits)).sum(-1, dtype=np.uint8)
         row, column = np.nonzero(escaped)
         room[row, head + (np.cumsum(escaped, 1) - 1)[row, column]] = rows[row, column]
         packed[chosen] = room
-    padded = np.zeros((blocks, -(-groups // 4) * 4), np.uint8)
-    padded[:, :groups] = modes
-    shifted = padded.reshape(blocks, padded.shape[1] // 4, 4) << np.array([0, 2, 4, 6], np.uint8)
-    header = shifted.sum(-1, dtype=np.uint8)
+    padded = np.pad(modes.astype(np.uint8), ((0, 0), (0, -groups % 4))).reshape(blocks, -1, 4)
+    header = (padded << _shifts(2)[::-1]).sum(-1, dtype=np.uint8)
     all_bytes = np.concatenate([header, packed.reshape(blocks, -1)], 1)
-    used = np.arange(24) < lengths[..., None]
-    used = np.concatenate([np.ones(header.shape, bool), used.reshape(blocks, -1)], 1)
+    used = (np.arange(_MOST_GROUP_BYTES) < lengths[..., None]).reshape(blocks, -1)
+    used = np.pad(used, ((0, 0), (header.shape[1], 0)), constant_values=True)
     return all_bytes[used].tobytes()
 
 
-# How many codes of a byte say that the value follows as a byte of its own.
+def _shifts(bits: int) -> np.ndarray:
+    """Return by how much numbers of 2 or 4 bits in a byte are shifted, the upper first."""
+    return np.arange(8 - bits, -1, -bits, dtype=np.uint8)
+
+
+# By modes: how many codes of each byte say that the value follows as a byte of its own.
 _ESCAPES = {
-    bits: bytes(
-        sum((byte >> shift) & (1 << bits) - 1 == (1 << bits) - 1 for shift in range(0, 8, bits))
-        for byte in range(256)
-    )
-    for bits in (2, 4)
+    mode: (np.arange(256)[:, None] >> _shifts(bits) & escape == escape).sum(1, dtype=np.uint8).tobytes()
+    for mode, bits, escape in _PACKED
 }
 
 
@@ -109,31 +103,28 @@ def decode(data: bytes, count: int, stride: int) -> np.ndarray:
     """
     if stride % 4 or not 0 < stride <= 256:
         raise ValueError(f"expected a stride of 4, 8, ... 256, but got {stride}")
+    wrong = ValueError(f"expected {count} elements by attribute codec 0, but got other bytes")
     if len(data) < least_bytes(count, stride) or data[0] != _HEADER:
-        raise ValueError(f"expected {count} elements by attribute codec 0, but got other bytes")
+        raise wrong
     size, begin, places, modes = _block_elements(stride), 1, array("q"), bytearray()
     end = len(data) - max(_TAIL, stride)
-    two, four = _ESCAPES[2], _ESCAPES[4]
     for first in range(0, count, size):
         groups = -(-min(size, count - first) // _GROUP)
         for _ in range(stride):
             header, begin = begin, begin + -(-groups // 4)
             if begin > end:
-                raise ValueError("expected compressed data to go on, but they ended")
+                raise wrong
             for group in range(groups):
                 mode = data[header + group // 4] >> 2 * (group % 4) & 3
                 places.append(begin)
                 modes.append(mode)
-                if mode == 1:
-                    begin += 4 + sum(two[byte] for byte in data[begin : begin + 4])
-                elif mode == 2:
-                    begin += 8 + sum(four[byte] for byte in data[begin : begin + 8])
-                elif mode == 3:
-                    begin += 16
-        if begin > end:
-            raise ValueError("expected compressed data to go on, but they ended")
+                if mode == 3:
+                    begin += _GROUP
+                elif mode:
+                    head = 4 * mode
+                    begin += head + sum(data[begin : begin + head].translate(_ESCAPES[mode]))
     if begin != end:
-        raise ValueError(f"expected {count} elements by attribute codec 0, but got more")
+        raise wrong
     values = _groups(
         np.frombuffer(data, np.uint8), np.frombuffer(places, np.int64), np.frombuffer(modes, np.uint8)
     )
@@ -152,18 +143,15 @@ def decode(data: bytes, count: int, stride: int) -> np.ndarray:
 def _groups(data: np.ndarray, places: np.ndarray, modes: np.ndarray) -> np.ndarray:
     """Unpack groups that begin at places (G,) of data: values (G, 16)."""
     values = np.zeros((len(places), _GROUP), np.uint8)
-    data = np.concatenate([data, np.zeros(24, np.uint8)])
-    plain = modes == 3
-    values[plain] = data[places[plain, None] + np.arange(_GROUP)]
-    for mode, most in ((1, 3), (2, 15)):
-        chosen = modes == mode
-        begins, bits = places[chosen], _BITS[mode]
-        each = 8 // bits
-        shifts = (bits * np.arange(each - 1, -1, -1)).astype(np.uint8)
-        head = data[begins[:, None] + np.arange(_GROUP // each)]
-        codes = (head[..., None] >> shifts & most).reshape(-1, _GROUP)
-        row, column = np.nonzero(codes == most)
-        extra = begins[:, None] + _GROUP // each + np.cumsum(codes == most, 1) - 1
+    data = np.concatenate([data, np.zeros(_MOST_GROUP_BYTES, np.uint8)])
+    values[modes == 3] = data[places[modes == 3, None] + np.arange(_GROUP)]
+    for mode, bits, escape in _PACKED:
+        chosen, head = modes == mode, 2 * bits
+        begins = places[chosen, None]
+        codes = data[begins + np.arange(head)]
+        codes = (codes[..., None] >> _shifts(bits) & escape).reshape(-1, _GROUP)
+        row, column = np.nonzero(codes == escape)
+        extra = begins + head + np.cumsum(codes == escape, 1) - 1
         codes[row, column] = data[extra[row, column]]
         values[chosen] = codes
     return values

@@ -5,9 +5,9 @@ from __future__ import annotations
 import json
 import math
 import struct
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from reprlib import repr as short
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -17,19 +17,20 @@ from forewarp.fields.moving import MARGIN, MovingGaussians, NodeMotion
 from forewarp.fields.windows import MovingWindows, Window, check_windows, taken, with_shared
 from forewarp.files import MOST_CONFIG, read_bytes
 from forewarp.glb import meshopt
-from forewarp.glb.container import CHUNKS, COMPONENTS, COMPRESSION, ELEMENTS, MAGIC, VERSION
+from forewarp.glb.container import CAMERA_AXES, CHUNKS, COMPONENTS, COMPRESSION, ELEMENTS, MAGIC, VERSION
 from forewarp.glb.writer import FORMAT, MOTION, SPLATS, WINDOWS, Setting
+from forewarp.ops.backend import is_number
 from forewarp.ops.gaussians import LEAST_LOG
 from forewarp.scene.camera import Camera, Lens
 
-_KNOWN = {COMPRESSION, SPLATS, MOTION}  # extensions that a file may require
-FEATURES = frozenset({WINDOWS})  # names that a file may list of what a reader must know
+_EXTENSIONS = COMPRESSION, SPLATS, MOTION  # that a file may require
+_FEATURES = (WINDOWS,)  # names that a file may list of what a reader must know
 # At most: degree of the harmonics, cosines over time, accessors of links.
 _MOST = 1 << 28  # bytes of the file, and of all its arrays: some 200,000 particles of degree 3
 _DEGREES, _COSINES, _LINKS = 3, 64, 16
 _WINDOWS = 1000  # at most
-FARTHEST = 0.2  # of all time: no image's time is off by more
-_ONE_FILTER = {"NONE": None, "EXPONENTIAL": None, "QUATERNION": 8}  # the stride that a filter asks for
+_FARTHEST = 0.2  # of all time: no image's time is off by more
+_FILTERS = {"NONE": None, "EXPONENTIAL": meshopt.from_exponential, "QUATERNION": meshopt.from_quaternion}
 
 
 class Fields:
@@ -42,7 +43,7 @@ class Fields:
 
     def __init__(self, content: Any, place: str) -> None:
         if not isinstance(content, dict):
-            raise ValueError(f"{place}: expected an object, but got {_short(content)}")
+            raise ValueError(f"{place}: expected an object, but got {short(content)}")
         self.content, self.place = content, place
 
     def __contains__(self, key: str) -> bool:
@@ -50,20 +51,20 @@ class Fields:
 
     def _get(self, key: str, expected: str, good, default=None):
         value = self.content.get(key, default)
-        if value is None or isinstance(value, bool) != (expected == "true or false") or not good(value):
-            got = _short(value) if key in self.content else "none"
+        if value is None or not good(value):
+            got = short(value) if key in self.content else "none"
             raise ValueError(f"{self.place}.{key}: expected {expected}, but got {got}")
         return value
 
     def whole(self, key: str, least: int, most: int, default: int | None = None) -> int:
         """Return a whole number from ``least`` to ``most``."""
-        good = lambda n: isinstance(n, int) and least <= n <= most  # noqa: E731
-        return self._get(key, f"a whole number from {least} to {most}", good, default)
+        expected = f"a whole number from {least} to {most}"
+        return self._get(key, expected, lambda n: type(n) is int and least <= n <= most, default)
 
     def number(self, key: str, least: float, most: float, default: float | None = None) -> float:
         """Return a number from ``least`` to ``most``."""
-        good = lambda x: isinstance(x, int | float) and least <= x <= most  # noqa: E731
-        return float(self._get(key, f"a number from {least:g} to {most:g}", good, default))
+        expected = f"a number from {least:g} to {most:g}"
+        return float(self._get(key, expected, lambda x: is_number(x) and least <= x <= most, default))
 
     def fixed(self, key: str, value: float) -> None:
         """Refuse a number, if there is one, that is not the only one that version 1 has."""
@@ -72,38 +73,39 @@ class Fields:
 
     def numbers(self, key: str, count: int, default: list[float] | None = None) -> list[float]:
         """Return ``count`` finite numbers."""
-        values = self._get(
-            key, f"{count} numbers", lambda v: isinstance(v, list) and len(v) == count, default
-        )
-        if not all(type(x) in (int, float) and abs(x) < 1e30 for x in values):
-            raise ValueError(f"{self.place}.{key}: expected {count} numbers, but got {_short(values)}")
-        return [float(x) for x in values]
+
+        def good(values) -> bool:
+            some = isinstance(values, list) and len(values) == count
+            return some and all(is_number(x) and abs(x) < 1e30 for x in values)
+
+        return list(map(float, self._get(key, f"{count} numbers", good, default)))
 
     def text(self, key: str, default: str | None = None) -> str:
         """Return a text."""
-        return self._get(key, "a text", lambda v: isinstance(v, str), default)
+        return self._get(key, "a text", lambda value: isinstance(value, str), default)
 
-    def flag(self, key: str, default: bool) -> bool:
-        """Return true or false."""
-        return self._get(key, "true or false", lambda v: isinstance(v, bool), default)
+    def flag(self, key: str) -> bool:
+        """Return true or false, which it is if it is missing."""
+        return self._get(key, "true or false", lambda value: isinstance(value, bool), default=False)
 
-    def items(self, key: str, default: list | None = None, most: int = MOST_CONFIG) -> list:
-        """Return a list of at most so many."""
-        good = lambda v: isinstance(v, list) and len(v) <= most  # noqa: E731
-        return self._get(key, f"a list of at most {most}", good, default)
+    def items(self, key: str, most: int = MOST_CONFIG) -> list:
+        """Return a list of at most so many; an empty one if it is missing."""
+        good = lambda value: isinstance(value, list) and len(value) <= most  # noqa: E731
+        return self._get(key, f"a list of at most {most}", good, [])
+
+    def check_known(self, key: str, known: tuple[str, ...]) -> None:
+        """Refuse a list with other names than those that are known here."""
+        if others := [name for name in self.items(key) if name not in known]:
+            got = short(others[0])
+            raise ValueError(f"{self.place}: expected {key} known here, but got {got}; update forewarp")
 
     def parts(self, key: str) -> list[Fields]:
         """Return a list of parts; none if it is missing."""
-        return [Fields(part, f"{self.place}.{key}[{n}]") for n, part in enumerate(self.items(key, []))]
+        return [Fields(part, f"{self.place}.{key}[{n}]") for n, part in enumerate(self.items(key))]
 
-    def part(self, key: str) -> Fields:
+    def part(self, key: str, default: dict | None = None) -> Fields:
         """Return a part."""
-        return Fields(self.content.get(key), f"{self.place}.{key}")
-
-
-def _short(value: Any) -> str:
-    text = repr(value)
-    return text if len(text) <= 60 else text[:57] + "..."
+        return Fields(self.content.get(key, default), f"{self.place}.{key}")
 
 
 class Container:
@@ -124,16 +126,14 @@ class Container:
             raise ValueError(f"expected version {VERSION} of glTF, but got {version}")
         if length != len(data):
             raise ValueError(f"expected {length} bytes, as its header says, but got {len(data)}")
-        chunks, begin = {}, 12
-        while begin + 8 <= length:
-            size, kind = struct.unpack_from("<I4s", data, begin)
-            if begin + 8 + size > length:
-                raise ValueError(f"expected a chunk of {size} bytes, but got {length - begin - 8}")
-            chunks.setdefault(kind, memoryview(data)[begin + 8 : begin + 8 + size])
+        chunks, begin = [], 12
+        for wanted in CHUNKS:
+            size, kind = struct.unpack_from("<I4s", data, begin) if begin + 8 <= length else (0, b"")
+            if kind != wanted or begin + 8 + size > length:
+                raise ValueError("expected a whole chunk of JSON and one of arrays, but got others")
+            chunks.append(memoryview(data)[begin + 8 : begin + 8 + size])
             begin += 8 + size
-        text, binary = (chunks.get(kind) for kind in CHUNKS)
-        if text is None or binary is None:
-            raise ValueError("expected a chunk of JSON and one of arrays, but got others")
+        text, binary = chunks
         if len(text) > MOST_CONFIG:
             raise ValueError(f"expected at most {MOST_CONFIG} bytes of JSON, but got {len(text)}")
         self.description, self.binary = Fields(_parsed(bytes(text)), "glTF"), binary
@@ -141,19 +141,25 @@ class Container:
         self._decoded: dict[int, np.ndarray] = {}
         self._room = _MOST
 
-    def array(self, number: Any, kind: str, count: int | None = None, *, place: str) -> np.ndarray:
-        """Return an accessor's rows (N, 1), (N, 3) or (N, 4): whole numbers, or float32 that are finite.
+    def array(self, part: Fields, key: str, kind: str, count: int | None = None) -> np.ndarray:
+        """Return the rows (N, 1), (N, 3) or (N, 4) of an accessor: whole numbers, or float32 that are finite.
 
         Args:
-            number: of the accessor.
+            part: of the description.
+            key: of its property that has the accessor's number.
             kind: ``SCALAR``, ``VEC3`` or ``VEC4``.
             count: of its rows; None: as it says.
-            place: what asks for it, for errors.
         """
+        return self._rows(part.content.get(key), kind, count, f"{part.place}.{key}")
+
+    def arrays(self, part: Fields, key: str, kind: str, count: int, most: int) -> list[np.ndarray]:
+        """Return the rows of each of at most so many accessors; see ``array``."""
+        return [self._rows(n, kind, count, f"{part.place}.{key}") for n in part.items(key, most)]
+
+    def _rows(self, number: Any, kind: str, count: int | None, place: str) -> np.ndarray:
         if type(number) is not int or not 0 <= number < len(self.accessors):
-            raise ValueError(
-                f"{place}: expected one of {len(self.accessors)} accessors, but got {_short(number)}"
-            )
+            got = short(number)
+            raise ValueError(f"{place}: expected one of {len(self.accessors)} accessors, but got {got}")
         accessor, width = self.accessors[number], {name: n for n, name in ELEMENTS.items()}[kind]
         rows = accessor.whole("count", 1, _MOST)
         if accessor.text("type") != kind or (count is not None and rows != count):
@@ -171,7 +177,7 @@ class Container:
         self._take(rows * width * np.dtype(np.float32).itemsize, place)  # many accessors may read one view
         strides = (stride, dtype.itemsize)
         values = np.ndarray((rows, width), dtype, elements.data, offset, strides).copy()
-        if accessor.flag("normalized", False):
+        if accessor.flag("normalized"):
             one = np.iinfo(dtype).max if dtype.kind != "f" else 1
             values = np.maximum(values / np.float32(one), -1).astype(np.float32)
         if values.dtype.kind == "f" and not np.isfinite(values).all():
@@ -183,8 +189,8 @@ class Container:
         view = self.views[number]
         stride = view.whole("byteStride", 4, 252, 0) if "byteStride" in view else 0
         if number not in self._decoded:
-            extensions = view.part("extensions") if "extensions" in view else None
-            if extensions is None or COMPRESSION not in extensions:
+            extensions = view.part("extensions", {})
+            if COMPRESSION not in extensions:
                 self._decoded[number] = np.frombuffer(self._bytes(view), np.uint8)
             else:
                 self._decoded[number] = self._uncompressed(extensions.part(COMPRESSION))
@@ -205,23 +211,16 @@ class Container:
 
     def _uncompressed(self, part: Fields) -> np.ndarray:
         data, stride = bytes(self._bytes(part)), part.whole("byteStride", 4, 256)
-        count, mode, name = (
-            part.whole("count", 1, _MOST),
-            part.text("mode"),
-            part.text("filter", "NONE"),
-        )
-        if mode != "ATTRIBUTES" or name not in _ONE_FILTER or _ONE_FILTER[name] not in (None, stride):
+        count, mode, name = part.whole("count", 1, _MOST), part.text("mode"), part.text("filter", "NONE")
+        if mode != "ATTRIBUTES" or name not in _FILTERS or (name == "QUATERNION" and stride != 8):
             raise ValueError(f"{part.place}: expected attributes, but got {mode} by {name} of {stride} bytes")
         self._take(count * stride, part.place)
         try:
             elements = meshopt.decode(data, count, stride)
         except ValueError as error:
             raise ValueError(f"{part.place}: {error}") from None
-        if name == "EXPONENTIAL":
-            elements = meshopt.from_exponential(elements)
-        elif name == "QUATERNION":
-            elements = meshopt.from_quaternion(elements)
-        return elements.view(np.uint8).reshape(-1)
+        unfilter = _FILTERS[name]
+        return (elements if unfilter is None else unfilter(elements)).view(np.uint8).reshape(-1)
 
 
 def _parsed(text: bytes) -> Any:
@@ -231,16 +230,14 @@ def _parsed(text: bytes) -> Any:
     try:
         return json.loads(text, parse_constant=refuse)
     except (ValueError, RecursionError) as error:
-        raise ValueError(f"expected JSON, but got {_short(str(error))}") from None
+        raise ValueError(f"expected JSON, but got {short(str(error))}") from None
 
 
-@dataclass(frozen=True)
-class Contents:
-    """What a file holds: ``gaussians``, in its order, and their ``setting``; its format's ``version``."""
+class Contents(NamedTuple):
+    """What a file holds: ``gaussians``, in its order, and their ``setting``."""
 
     gaussians: MovingGaussians | MovingWindows
     setting: Setting
-    version: str
 
 
 def read(path: Path) -> Contents:
@@ -261,17 +258,13 @@ def read(path: Path) -> Contents:
 
 def _scene(container: Container) -> Contents:
     description = container.description
-    required = description.items("extensionsRequired", [])
-    if unknown := [name for name in required if name not in _KNOWN]:
-        raise ValueError(f"expected extensions known here, but got {_short(unknown[0])}")
-    number, primitive, splats = _primitive(description)
-    motion = splats.part("extensions").part(MOTION)
+    description.check_known("extensionsRequired", _EXTENSIONS)
+    number, attributes, motion = _moving_node(description)
     version = motion.text("version")
     if version.split(".")[0] != FORMAT.split(".")[0]:
-        raise ValueError(f"expected version {FORMAT}, but got {_short(version)}; update forewarp")
-    if unknown := [name for name in motion.items("features", []) if name not in FEATURES]:
-        raise ValueError(f"expected features known here, but got {_short(unknown[0])}; update forewarp")
-    gaussians = _gaussians(container, primitive.part("attributes"), motion)
+        raise ValueError(f"expected version {FORMAT}, but got {short(version)}; update forewarp")
+    motion.check_known("features", _FEATURES)
+    gaussians = _gaussians(container, attributes, motion)
     if WINDOWS in motion:
         gaussians = _windows(container, gaussians, motion)
     setting = Setting(
@@ -280,7 +273,7 @@ def _scene(container: Container) -> Contents:
         motion.number("seconds", 1e-3, 1e6, 4),
         tuple(motion.numbers("background", 3, [1, 1, 1])),
     )
-    return Contents(gaussians, setting, version)
+    return Contents(gaussians, setting)
 
 
 def _windows(container: Container, first: MovingGaussians, motion: Fields) -> MovingWindows:
@@ -289,20 +282,18 @@ def _windows(container: Container, first: MovingGaussians, motion: Fields) -> Mo
     parts, meshes = about.parts("list"), description.parts("meshes")
     if not 2 <= len(parts) <= _WINDOWS:
         raise ValueError(f"{about.place}.list: expected 2 to {_WINDOWS} windows, but got {len(parts)}")
-    still = torch.arange(len(first.means))[len(first.means) - about.whole("shared", 0, len(first.means), 0) :]
+    shared = taken(first, slice(len(first.means) - about.whole("shared", 0, len(first.means), 0), None))
     spans = [tuple(part.numbers("span", 2)) for part in parts]
     begins = [part.number("from", 0, 1) for part in parts]
     if not all(0 <= begin < end <= 1 for begin, end in spans):
-        raise ValueError(f"{about.place}.list: expected spans in [0, 1], but got {_short(spans)}")
+        raise ValueError(f"{about.place}.list: expected spans in [0, 1], but got {short(spans)}")
     fade = about.number("fade", 0, 0.5, 0)
     check_windows(begins, spans, fade)
-    gaussians, shared = [first], taken(first, still)
+    gaussians = [first]
     for part in parts[1:]:
-        mesh = meshes[part.whole("mesh", 0, len(meshes) - 1)]
-        if (held := _held(mesh)) is None:
+        if (held := _held(meshes, part)) is None:
             raise ValueError(f"{part.place}.mesh: expected Gaussians with {MOTION}, but got none")
-        primitive, splats = held
-        own = _gaussians(container, primitive.part("attributes"), splats.part("extensions").part(MOTION))
+        own = _gaussians(container, *held)
         if _coefficients(own) != _coefficients(shared):
             raise ValueError(f"{part.place}: expected as many coefficients as the first window has")
         gaussians.append(with_shared(own, shared))
@@ -315,23 +306,21 @@ def _coefficients(gaussians: MovingGaussians) -> list[tuple | None]:
     return [None if part is None else tuple(part.shape[1:]) for part in parts]
 
 
-def _primitive(description: Fields) -> tuple[int, Fields, Fields]:
-    """Return the node that holds the moving Gaussians, their primitive, and its extension."""
-    nodes, meshes = description.parts("nodes"), description.parts("meshes")
-    for number, node in enumerate(nodes):
-        if "mesh" in node and (held := _held(meshes[node.whole("mesh", 0, len(meshes) - 1)])) is not None:
+def _moving_node(description: Fields) -> tuple[int, Fields, Fields]:
+    """Return the number of the node that holds the moving Gaussians, and what ``_held`` returns of it."""
+    meshes = description.parts("meshes")
+    for number, node in enumerate(description.parts("nodes")):
+        if "mesh" in node and (held := _held(meshes, node)) is not None:
             return number, *held
     raise ValueError(f"expected Gaussians with {MOTION}, but got a glTF without them")
 
 
-def _held(mesh: Fields) -> tuple[Fields, Fields] | None:
-    """Return the primitive of a mesh that holds moving Gaussians, and its extension; None: there is none."""
-    for primitive in mesh.parts("primitives"):
-        extensions = primitive.content.get("extensions")
-        splats = extensions.get(SPLATS) if isinstance(extensions, dict) else None
-        inner = splats.get("extensions") if isinstance(splats, dict) else None
-        if isinstance(inner, dict) and MOTION in inner:
-            return primitive, Fields(splats, SPLATS)
+def _held(meshes: list[Fields], user: Fields) -> tuple[Fields, Fields] | None:
+    """Return the attributes and the motion of the Gaussians in a part's mesh; None: there are none."""
+    for primitive in meshes[user.whole("mesh", 0, len(meshes) - 1)].parts("primitives"):
+        inner = primitive.part("extensions", {}).part(SPLATS, {}).part("extensions", {})
+        if MOTION in inner:
+            return primitive.part("attributes"), Fields(inner.content[MOTION], MOTION)
     return None
 
 
@@ -339,19 +328,18 @@ def _gaussians(container: Container, attributes: Fields, motion: Fields) -> Movi
     """Read the canonical state and what is added to it."""
     place = attributes.place
 
+    count = None
+
     def array(key: str, kind: str) -> torch.Tensor:
-        values = container.array(attributes.content.get(key), kind, count, place=f"{place}.{key}")
+        values = container.array(attributes, key, kind, count)
         if values.dtype.kind != "f":
             raise ValueError(f"{place}.{key}: expected floats or normalised numbers, but got whole ones")
         return torch.from_numpy(values)
 
-    count = None
     means = array("POSITION", "VEC3")
     count = len(means)
-    quaternions, scales, opacity = (
-        array(f"{SPLATS}:{key}", kind)
-        for key, kind in (("ROTATION", "VEC4"), ("SCALE", "VEC3"), ("OPACITY", "SCALAR"))
-    )
+    kinds = {"ROTATION": "VEC4", "SCALE": "VEC3", "OPACITY": "SCALAR"}
+    quaternions, scales, opacity = (array(f"{SPLATS}:{key}", kind) for key, kind in kinds.items())
     for key, good in (("SCALE", scales >= 0), ("OPACITY", (opacity >= 0) & (opacity <= 1))):
         if not bool(good.all()):
             raise ValueError(f"{place}.{SPLATS}:{key}: expected numbers in its range, but got others")
@@ -362,17 +350,14 @@ def _gaussians(container: Container, attributes: Fields, motion: Fields) -> Movi
         degree += 1
 
     def over_time(key: str, kind: str) -> torch.Tensor | None:
-        numbers = motion.items(key, [], most=_COSINES)
-        parts = [container.array(n, kind, count, place=f"{MOTION}.{key}") for n in numbers]
-        return torch.from_numpy(np.stack(parts, 1).astype(np.float32)) if parts else None
+        parts = container.arrays(motion, key, kind, count, _COSINES)
+        return _floats(np.stack(parts, 1)) if parts else None
 
     colors, opacities = over_time("colorOverTime", "VEC3"), over_time("opacityOverTime", "SCALAR")
     logits = torch.logit(opacity.double())[:, 0].float()
     if opacities is not None:
         opacities = opacities[..., 0]
-        number = motion.content.get("opacityLogits")
-        logits = container.array(number, "SCALAR", count, place=f"{MOTION}.opacityLogits")[:, 0]
-        logits = torch.from_numpy(logits.astype(np.float32))
+        logits = _floats(container.array(motion, "opacityLogits", "SCALAR", count))[:, 0]
     canonical_time = motion.number("canonicalTime", 0, 1)
     motion.fixed("cutoff", math.exp(LEAST_LOG))
     motion.fixed("margin", MARGIN)
@@ -382,6 +367,10 @@ def _gaussians(container: Container, attributes: Fields, motion: Fields) -> Movi
     )  # fmt: skip
 
 
+def _floats(values: np.ndarray) -> torch.Tensor:
+    return torch.from_numpy(values.astype(np.float32, copy=False))
+
+
 def _motion(container: Container, motion: Fields, canonical_time: float, count: int) -> NodeMotion | None:
     """Read nodes and links; None where nothing moves."""
     moving = motion.whole("moving", 0, count)
@@ -389,26 +378,21 @@ def _motion(container: Container, motion: Fields, canonical_time: float, count: 
     if not moving:
         return None
     nodes, about = motion.part("nodes"), motion.part("curve")
-
-    def array(key: str, rows: int | None = None) -> torch.Tensor:
-        values = container.array(nodes.content.get(key), "VEC3", rows, place=f"{nodes.place}.{key}")
-        return torch.from_numpy(values.astype(np.float32, copy=False))
-
-    positions = array("positions")
+    positions = _floats(container.array(nodes, "positions", "VEC3"))
     kind, frames = about.text("kind"), about.whole("frames", 2, 10**9)
-    natural = kind == "spline" and about.flag("natural", False)
+    natural = kind == "spline" and about.flag("natural")
     if kind not in KINDS:
-        raise ValueError(f"{about.place}.kind: expected {' or '.join(KINDS)}, but got {_short(kind)}")
+        raise ValueError(f"{about.place}.kind: expected {' or '.join(KINDS)}, but got {short(kind)}")
     least = 1 if kind == "cosines" else 2 if natural else 4
     number = about.whole("count", least, frames - 1 if kind == "cosines" else 10**6)
     if kind == "cosines":
         about.fixed("padding", PADDING)
-    curves = [
-        array(key, len(positions) * number).reshape(-1, number, 3)
-        if key in nodes or key == "translations"
-        else None
-        for key in ("translations", "rotations")
-    ]
+
+    def curves(key: str) -> torch.Tensor:
+        values = container.array(nodes, key, "VEC3", len(positions) * number)
+        return _floats(values).reshape(-1, number, 3)
+
+    translations, rotations = curves("translations"), curves("rotations") if "rotations" in nodes else None
     links, weights = _links(container, motion, moving, len(positions))
     padded = torch.zeros(2, count, links.shape[1])
     padded[0, :moving], padded[1, :moving] = links, weights
@@ -416,7 +400,7 @@ def _motion(container: Container, motion: Fields, canonical_time: float, count: 
     times, offsets = _offsets(container, motion)
     if kind == "cosines" and times:
         raise ValueError(f"{about.place}.kind: expected spline, as there are timeOffsets, but got 'cosines'")
-    return NodeMotion(positions, *curves, curve, padded[0].int(), padded[1], times, offsets)
+    return NodeMotion(positions, translations, rotations, curve, padded[0].int(), padded[1], times, offsets)
 
 
 def _links(
@@ -425,9 +409,7 @@ def _links(
     """Read the nodes (N, L) that those that move follow, and their shares, which sum to 1."""
     tables = []
     for key in ("links", "weights"):
-        numbers = motion.items(key, most=_LINKS)
-        parts = [container.array(n, "VEC4", moving, place=f"{MOTION}.{key}") for n in numbers]
-        if not parts:
+        if not (parts := container.arrays(motion, key, "VEC4", moving, _LINKS)):
             raise ValueError(f"{MOTION}.{key}: expected accessors, but got none")
         tables.append(np.concatenate(parts, 1))
     links, weights = tables
@@ -436,7 +418,7 @@ def _links(
     total = weights.sum(1, keepdims=True, dtype=np.float64)
     if weights.min() < 0 or not (total > 0).all():
         raise ValueError(f"{MOTION}.weights: expected numbers >= 0, and one above, but got others")
-    return torch.from_numpy(links.astype(np.int32)), torch.from_numpy((weights / total).astype(np.float32))
+    return torch.from_numpy(links.astype(np.int32)), _floats(weights / total)
 
 
 def _offsets(container: Container, motion: Fields) -> tuple[list[float], list[float]]:
@@ -444,16 +426,12 @@ def _offsets(container: Container, motion: Fields) -> tuple[list[float], list[fl
     if "timeOffsets" not in motion:
         return [], []
     part = motion.part("timeOffsets")
-    times, offsets = (
-        container.array(part.content.get(key), "SCALAR", place=f"{part.place}.{key}")[:, 0].astype(float)
-        for key in ("times", "offsets")
-    )
+    columns = (container.array(part, key, "SCALAR")[:, 0] for key in ("times", "offsets"))
+    times, offsets = (column.astype(float) for column in columns)
     good = len(times) == len(offsets) and bool((np.diff(times) > 0).all()) and 0 <= times[0] <= times[-1] <= 1
-    if not good or float(np.abs(offsets).max()) > FARTHEST + 1e-6:
-        raise ValueError(
-            f"{part.place}: expected ascending times in [0, 1] with offsets of at most {FARTHEST}, but got "
-            "others"
-        )
+    if not good or float(np.abs(offsets).max()) > _FARTHEST + 1e-6:
+        expected = f"ascending times in [0, 1] with offsets of at most {_FARTHEST}"
+        raise ValueError(f"{part.place}: expected {expected}, but got others")
     return times.tolist(), offsets.tolist()
 
 
@@ -464,9 +442,9 @@ def _cameras(description: Fields, scene: int) -> tuple[list[Camera], torch.Tenso
         if key in nodes[scene]:
             raise ValueError(f"{nodes[scene].place}.{key}: expected a rotation alone, but got this, too")
     found = []
-    for number in nodes[scene].items("children", []):
+    for number in nodes[scene].items("children"):
         if type(number) is not int or not 0 <= number < len(nodes):
-            raise ValueError(f"{nodes[scene].place}.children: expected nodes, but got {_short(number)}")
+            raise ValueError(f"{nodes[scene].place}.children: expected nodes, but got {short(number)}")
         if "camera" in (node := nodes[number]):
             camera = cameras[node.whole("camera", 0, len(cameras) - 1)]
             found.append(_camera(node, camera.part("extras"), camera.part("perspective")))
@@ -478,13 +456,13 @@ def _rotation(node: Fields) -> torch.Tensor:
 
     quaternion = node.numbers("rotation", 4, [0, 0, 0, 1])
     if math.hypot(*quaternion) < 0.5:
-        raise ValueError(f"{node.place}.rotation: expected a unit quaternion, but got {_short(quaternion)}")
+        raise ValueError(f"{node.place}.rotation: expected a unit quaternion, but got {short(quaternion)}")
     return torch.from_numpy(Rotation.from_quat(quaternion).as_matrix())
 
 
 def _camera(node: Fields, extras: Fields, perspective: Fields) -> Camera:
     pose = torch.eye(4, dtype=torch.float64)
-    pose[:3, :3] = _rotation(node) * torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64)
+    pose[:3, :3] = _rotation(node) * CAMERA_AXES
     pose[:3, 3] = torch.tensor(node.numbers("translation", 3, [0, 0, 0]), dtype=torch.float64)
     lens = extras.numbers("lens", 5) if "lens" in extras else None
     return Camera(

@@ -13,16 +13,9 @@ from torch import Tensor
 
 from forewarp.fields.curves import PADDING
 from forewarp.fields.moving import MARGIN, MovingGaussians, NodeMotion
-from forewarp.fields.windows import longest_fade
+from forewarp.fields.windows import Window, longest_fade
 from forewarp.glb import meshopt
-from forewarp.glb.container import (
-    BYTE,
-    COMPRESSION,
-    SHORT,
-    SIGNED_UNIT_SHORT,
-    UNIT_BYTE,
-    Buffer,
-)
+from forewarp.glb.container import BYTE, CAMERA_AXES, SHORT, SIGNED_SHORT, UNIT_BYTE, Buffer, quaternion_of
 from forewarp.ops.gaussians import LEAST_LOG
 from forewarp.scene.camera import Camera
 
@@ -51,100 +44,55 @@ class Setting:
     times: Sequence[float] = ()
 
 
-@dataclass(frozen=True)
-class Later:
-    """A window of a film after the first one: ``rows`` (of ``rows_in_file``) of ``gaussians``, without those
-    that all windows share; see ``fields.windows.Window``.
-    """
-
-    gaussians: MovingGaussians
-    rows: Rows
-    span: tuple[float, float]
-    begin: float
-
-
-def write(
-    gaussians: MovingGaussians,
-    setting: Setting,
-    quality: str,
-    rows: Rows,
-    *,
-    span: tuple[float, float] = (0.0, 1.0),
-    shared: int = 0,
-    later: Sequence[Later] = (),
-) -> bytes:
+def write(windows: Sequence[tuple[Window, Rows]], setting: Setting, quality: str, shared: int = 0) -> bytes:
     """Return the file.
 
     Args:
-        gaussians: on the CPU.
+        windows: of the film, or the only one: Gaussians on the CPU, and which of their rows are written; of
+            windows after the first one without those that all share.
         setting: what else is in the file.
         quality: ``compact``: rounded to what an eye can tell; ``lossless``: float32.
-        rows: of ``rows_in_file``.
-        span: of a film in windows, that of the first one.
-        shared: how many of the last rows all windows show.
-        later: the other windows.
+        shared: how many of the last rows of the first window all show.
     """
-    store = _Store(compact=quality == COMPACT)
-    buffer = store.buffer
-    primitives = [_primitive(store, setting, part, order) for part, order in _parts(gaussians, rows, later)]
+    store = _Store(compressed=quality == COMPACT)
+    primitives = [_primitive(store, setting.cameras, window.gaussians, rows) for window, rows in windows]
     motion = primitives[0]["extensions"][SPLATS]["extensions"][MOTION]
-    motion |= _setting(setting)
-    if later:
+    motion |= {"seconds": setting.seconds, "background": list(setting.background)}
+    motion |= {"focus": setting.focus.tolist(), "cutoff": math.exp(LEAST_LOG), "margin": MARGIN}
+    if len(windows) > 1:
+        begins, spans = zip(*((window.begin, window.span) for window, _ in windows))
+        about = [{"span": list(span), "from": begin} for begin, span in zip(begins, spans)]
+        for number, window in enumerate(about[1:], 1):
+            window["mesh"] = number
         motion["features"] = [WINDOWS]
-        windows = [{"span": list(span), "from": 0.0}]
-        windows += [{"mesh": n, "span": list(w.span), "from": w.begin} for n, w in enumerate(later, 1)]
-        fade = longest_fade([w["from"] for w in windows], [w["span"] for w in windows])
-        motion[WINDOWS] = {"shared": shared, "fade": fade, "list": windows}
+        motion[WINDOWS] = {"shared": shared, "fade": longest_fade(begins, spans), "list": about}
     cameras = [_camera(camera) for camera in setting.cameras]
     for camera, time in zip(cameras, setting.times):
         camera["extras"]["time"] = time
-    nodes = [
-        {"name": "scene", "rotation": _quaternion(setting.rotation), "mesh": 0}
-        | {"children": list(range(1, len(cameras) + 1))}
-    ]
-    names = ["start", *(f"camera {number}" for number in range(1, len(cameras)))]
-    for number, (name, camera) in enumerate(zip(names, setting.cameras)):
-        pose = camera.camera_to_world[:3, :3].double() * torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64)
-        place = {"rotation": _quaternion(pose), "translation": camera.center.tolist()}
-        nodes.append({"name": name, "camera": number} | place)
-    description = {
-        "asset": {"version": "2.0", "generator": "forewarp"},
-        "extensionsUsed": [SPLATS, MOTION, *[COMPRESSION] * buffer.compressed],
-        **({"extensionsRequired": [COMPRESSION]} if buffer.compressed else {}),
-        "scene": 0,
-        "scenes": [{"nodes": [0]}],
-        "nodes": nodes,
-        "cameras": cameras,
-        "meshes": [{"primitives": [primitive]} for primitive in primitives],
-    }
-    return buffer.packed(description)
+    node = {"name": "scene", "rotation": quaternion_of(setting.rotation), "mesh": 0}
+    nodes = [node | {"children": list(range(1, len(cameras) + 1))}]
+    for number, camera in enumerate(setting.cameras):
+        pose = camera.camera_to_world[:3, :3].double() * CAMERA_AXES
+        place = {"rotation": quaternion_of(pose), "translation": camera.center.tolist()}
+        nodes.append({"name": f"camera {number}" if number else "start", "camera": number} | place)
+    meshes = [{"primitives": [primitive]} for primitive in primitives]
+    description = {"extensionsUsed": [SPLATS, MOTION], "nodes": nodes, "cameras": cameras, "meshes": meshes}
+    return store.packed(description)
 
 
-def _parts(
-    gaussians: MovingGaussians, rows: Rows, later: Sequence[Later]
-) -> list[tuple[MovingGaussians, Rows]]:
-    return [(gaussians, rows), *((window.gaussians, window.rows) for window in later)]
-
-
-def _primitive(store: _Store, setting: Setting, gaussians: MovingGaussians, rows: Rows) -> dict:
+def _primitive(store: _Store, cameras: Sequence[Camera], gaussians: MovingGaussians, rows: Rows) -> dict:
     """Store Gaussians and their motion as a primitive of points."""
     order, moving, in_motion = rows
-    steps = _Steps.of(gaussians, setting)
-    attributes = _attributes(store, steps, gaussians, order)
+    pixel = _pixel(gaussians, cameras)
+    attributes = _attributes(store, pixel, gaussians, order)
     motion = {"version": FORMAT, "features": [], "canonicalTime": gaussians.canonical_time}
-    motion |= {"blur": gaussians.blur} | _over_time(store, steps, gaussians, order)
+    motion |= {"blur": gaussians.blur} | _over_time(store, gaussians, order)
     motion |= {"moving": moving, "inMotion": in_motion}
     if moving:
-        motion |= _motion(store, steps, gaussians.motion, order[:moving])
+        motion |= _motion(store, pixel, gaussians.motion, order[:moving])
     splats = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display", "projection": "perspective"}
     splats |= {"sortingMethod": "cameraDistance", "extensions": {MOTION: motion}}
     return {"mode": 0, "attributes": attributes, "extensions": {SPLATS: splats}}
-
-
-def _quaternion(rotation: Tensor) -> list[float]:
-    from scipy.spatial.transform import Rotation  # late, as its import takes time
-
-    return Rotation.from_matrix(rotation.numpy()).as_quat().tolist()  # x, y, z, w
 
 
 def _camera(camera: Camera) -> dict:
@@ -155,23 +103,12 @@ def _camera(camera: Camera) -> dict:
         "znear": max(camera.near, _LEAST_NEAR * camera.far),
         "zfar": camera.far,
     }
-    names = ("width", "height", "fx", "fy", "cx", "cy")
-    extras = {name: getattr(camera, name) for name in names}
+    extras = {name: getattr(camera, name) for name in ("width", "height", "fx", "fy", "cx", "cy")}
     if camera.skew:
         extras["skew"] = camera.skew
     if camera.lens is not None:
         extras["lens"] = [*camera.lens.k, *camera.lens.p]
     return {"type": "perspective", "perspective": perspective, "extras": extras}
-
-
-def _setting(setting: Setting) -> dict:
-    return {
-        "seconds": setting.seconds,
-        "background": list(setting.background),
-        "focus": setting.focus.tolist(),
-        "cutoff": math.exp(LEAST_LOG),
-        "margin": MARGIN,
-    }
 
 
 class Rows(NamedTuple):
@@ -226,11 +163,8 @@ def morton(points: np.ndarray) -> np.ndarray:
     return codes
 
 
-class _Store:
-    """Stores arrays in a buffer: ``compact`` ones rounded, others as float32."""
-
-    def __init__(self, *, compact: bool) -> None:
-        self.compact, self.buffer = compact, Buffer(compressed=compact)
+class _Store(Buffer):
+    """A buffer of arrays, in a compressed one rounded."""
 
     def stepped(self, values: np.ndarray, step: float, **options) -> int:
         """Store numbers in steps of the power of two at or below ``step``."""
@@ -243,58 +177,35 @@ class _Store:
         return self._exponential(values, exponents, **options)
 
     def _exponential(self, values: np.ndarray, exponents: np.ndarray | int, **options) -> int:
-        if not self.compact:
-            return self.buffer.add(values, **options)
+        if not self.compressed:
+            return self.add(values, **options)
         elements = meshopt.exponential(values.reshape(len(values), -1), exponents)
         decoded = meshopt.from_exponential(elements).reshape(values.shape)
-        return self.buffer.add(decoded, filtered=("EXPONENTIAL", elements), **options)
+        return self.add(decoded, filtered=("EXPONENTIAL", elements), **options)
 
     def quaternions(self, values: np.ndarray, bits: int, **options) -> int:
         """Store unit quaternions (N, 4) x, y, z, w with ``bits`` a component."""
-        if not self.compact:
-            return self.buffer.add(values, **options)
+        if not self.compressed:
+            return self.add(values, **options)
         elements = meshopt.quaternion(values, bits)
         decoded = meshopt.from_quaternion(elements)
-        return self.buffer.add(decoded, SIGNED_UNIT_SHORT, filtered=("QUATERNION", elements), **options)
+        return self.add(decoded, SIGNED_SHORT, filtered=("QUATERNION", elements), **options)
 
     def shares(self, values: np.ndarray, **options) -> int:
         """Store numbers in [0, 1]."""
-        if not self.compact:
-            return self.buffer.add(values, **options)
-        return self.buffer.add(np.rint(values * UNIT_BYTE.one), UNIT_BYTE, **options)
+        if not self.compressed:
+            return self.add(values, **options)
+        return self.add(np.rint(values * UNIT_BYTE.one), UNIT_BYTE, **options)
 
 
-@dataclass(frozen=True)
-class _Steps:
-    """How finely compact files store (docs/exports.md says what that costs).
-
-    Attributes:
-        length: of positions; world units, as are the next two.
-        curve: of nodes' translations.
-        scale: of standard deviations, or ``scale_bits`` of their own, whichever is coarser.
-        gibbs: of nodes' rotations.
-        color, harmonic: of coefficients of the constant harmonic, and of others.
-        tint: of colours over time.
-        logit: of opacity over time.
-        rotation_bits: of a component of a rotation.
-    """
-
-    length: float
-    curve: float
-    scale: float
-    scale_bits: int = 6
-    gibbs: float = 2**-11
-    color: float = 2**-7
-    harmonic: float = 2**-6
-    tint: float = 2**-7
-    logit: float = 2**-5
-    rotation_bits: int = 8
-
-    @classmethod
-    def of(cls, gaussians: MovingGaussians, setting: Setting) -> _Steps:
-        """Choose lengths as shares of what a pixel of the cameras spans."""
-        pixel = _pixel(gaussians, setting.cameras)
-        return cls(length=pixel / 16, curve=pixel / 32, scale=pixel / 16)
+# How finely compact files store (docs/exports.md says what that costs). As shares of what a pixel of cameras
+# spans: positions and standard deviations; translations of nodes. By bits: standard deviations, of their own,
+# where that is coarser; rotations.
+_LENGTH, _CURVE = 1 / 16, 1 / 32
+_SCALE_BITS, _ROTATION_BITS = 6, 8
+# Coefficients of the constant harmonic and of others, colours over time, opacity over time as logits, and the
+# rotations of nodes.
+_COLOR, _HARMONIC, _TINT, _LOGIT, _GIBBS = 2**-7, 2**-6, 2**-7, 2**-5, 2**-11
 
 
 def _pixel(gaussians: MovingGaussians, cameras: Sequence[Camera]) -> float:
@@ -306,26 +217,25 @@ def _pixel(gaussians: MovingGaussians, cameras: Sequence[Camera]) -> float:
     return max(min(spans), 1e-6 * cameras[0].far)
 
 
-def _attributes(store: _Store, steps: _Steps, gaussians: MovingGaussians, order: np.ndarray) -> dict:
+def _attributes(store: _Store, pixel: float, gaussians: MovingGaussians, order: np.ndarray) -> dict:
     """Store the canonical state as KHR_gaussian_splatting has it."""
     rows = torch.from_numpy(order)
     quaternions = _unit(gaussians.quaternions[rows].double())
     scales = gaussians.log_scales[rows].exp().numpy()
-    if store.compact:
+    if store.compressed:
         quaternions, scales = _sorted_axes(quaternions, scales)
     opacity = torch.sigmoid(gaussians.opacity[rows].double()).numpy()
-    vertices = {"vertices": True}
+    vertices, length = {"vertices": True}, _LENGTH * pixel
     attributes = {
-        "POSITION": store.stepped(gaussians.means[rows].numpy(), steps.length, bounds=True, **vertices),
-        f"{SPLATS}:ROTATION": store.quaternions(quaternions, steps.rotation_bits, **vertices),
-        f"{SPLATS}:SCALE": store.scaled(scales, steps.scale_bits, steps.scale, **vertices),
+        "POSITION": store.stepped(gaussians.means[rows].numpy(), length, bounds=True, **vertices),
+        f"{SPLATS}:ROTATION": store.quaternions(quaternions, _ROTATION_BITS, **vertices),
+        f"{SPLATS}:SCALE": store.scaled(scales, _SCALE_BITS, length, **vertices),
         f"{SPLATS}:OPACITY": store.shares(opacity, **vertices),
     }
     for number, harmonic in enumerate(gaussians.harmonics[rows].unbind(1)):
         degree = math.isqrt(number)
         name = f"{SPLATS}:SH_DEGREE_{degree}_COEF_{number - degree**2}"
-        step = steps.harmonic if number else steps.color
-        attributes[name] = store.stepped(harmonic.numpy(), step, **vertices)
+        attributes[name] = store.stepped(harmonic.numpy(), _HARMONIC if number else _COLOR, **vertices)
     return attributes
 
 
@@ -353,44 +263,39 @@ def _sorted_axes(quaternions: np.ndarray, scales: np.ndarray) -> tuple[np.ndarra
     return turned.as_quat(canonical=True), np.take_along_axis(scales, order, 1)
 
 
-def _over_time(store: _Store, steps: _Steps, gaussians: MovingGaussians, order: np.ndarray) -> dict:
+def _over_time(store: _Store, gaussians: MovingGaussians, order: np.ndarray) -> dict:
     """Store what time adds to colours and opacity, and the logits it adds to, which 8 bits do not tell."""
     parts = {}
     if gaussians.color_over_time is not None:
         colors = gaussians.color_over_time[order].unbind(1)
-        parts["colorOverTime"] = [store.stepped(color.numpy(), steps.tint) for color in colors]
+        parts["colorOverTime"] = [store.stepped(color.numpy(), _TINT) for color in colors]
     if gaussians.opacity_over_time is not None:
         logits = gaussians.opacity_over_time[order].unbind(1)
-        parts["opacityLogits"] = store.stepped(gaussians.opacity[order].numpy(), steps.logit)
-        parts["opacityOverTime"] = [store.stepped(logit.numpy(), steps.logit) for logit in logits]
+        parts["opacityLogits"] = store.stepped(gaussians.opacity[order].numpy(), _LOGIT)
+        parts["opacityOverTime"] = [store.stepped(logit.numpy(), _LOGIT) for logit in logits]
     return parts
 
 
-def _motion(store: _Store, steps: _Steps, motion: NodeMotion, rows: np.ndarray) -> dict:
+def _motion(store: _Store, pixel: float, motion: NodeMotion, rows: np.ndarray) -> dict:
     """Store the nodes, and what the particles in ``rows`` follow."""
     curve, count = motion.curve, motion.translations.shape[1]
-    nodes = {"positions": store.stepped(motion.positions.numpy(), steps.length)}
-    nodes["translations"] = store.stepped(motion.translations.reshape(-1, 3).numpy(), steps.curve)
+    nodes = {"positions": store.stepped(motion.positions.numpy(), _LENGTH * pixel)}
+    nodes["translations"] = store.stepped(motion.translations.reshape(-1, 3).numpy(), _CURVE * pixel)
     if motion.rotations is not None:
-        nodes["rotations"] = store.stepped(motion.rotations.reshape(-1, 3).numpy(), steps.gibbs)
+        nodes["rotations"] = store.stepped(motion.rotations.reshape(-1, 3).numpy(), _GIBBS)
     about = {"kind": curve.kind, "count": count, "frames": curve.times}
     about |= {"natural": curve.straight} if curve.kind == "spline" else {"padding": PADDING}
     parts = {"nodes": nodes, "curve": about}
     if len(motion.times):
-        pair = {"times": motion.times, "offsets": motion.offsets}
-        parts["timeOffsets"] = {
-            name: store.buffer.add(np.array(numbers, np.float32)) for name, numbers in pair.items()
-        }
+        parts["timeOffsets"] = {"times": store.add(motion.times), "offsets": store.add(motion.offsets)}
     links, weights = motion.links.numpy()[rows], motion.weights.numpy()[rows]
-    if store.compact:  # whoever reads them divides by their sum
+    if store.compressed:  # whoever reads them divides by their sum
         weights = np.rint(weights / weights.max(1, keepdims=True) * UNIT_BYTE.one) / UNIT_BYTE.one
     links, weights = _slots(links, weights)
     component = BYTE if len(motion.positions) <= 256 else SHORT
-    for name, table, add in (
-        ("links", links, lambda part: store.buffer.add(part, component)),
-        ("weights", weights, store.shares),
-    ):
-        parts[name] = [add(table[:, first : first + _SLOTS]) for first in range(0, table.shape[1], _SLOTS)]
+    blocks = [np.s_[:, first : first + _SLOTS] for first in range(0, links.shape[1], _SLOTS)]
+    parts["links"] = [store.add(links[block], component) for block in blocks]
+    parts["weights"] = [store.shares(weights[block]) for block in blocks]
     return parts
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import sys
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -27,6 +26,7 @@ from forewarp.glb.reader import read
 from forewarp.methods.method import HasMatter, HasTrajectories, Method
 from forewarp.metrics.lpips import find_lpips, find_lpips_weights
 from forewarp.metrics.registry import METRICS, NETS, ImageSuite
+from forewarp.ops.backend import is_number
 from forewarp.progress import Counted
 from forewarp.runs.build import build_run
 from forewarp.runs.config import is_swept, saved_config, trust_of
@@ -360,7 +360,7 @@ class Score:
         if self.name is None:
             return None
         value = self._stored().get(self.name)
-        if not isinstance(value, int | float) or not math.isfinite(value):
+        if not is_number(value):
             value = self._measured(module or self.run.load())
         if value is not None:
             print(f"score    {self.name} {value:.4f} of {self._views()}", flush=True)
