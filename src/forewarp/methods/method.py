@@ -251,8 +251,13 @@ class Method(nn.Module):
     def _load_from_state_dict(self, state_dict, prefix, *args, **kwargs) -> None:
         for name in self.adopted():  # including those of submodules, which load later
             if prefix + name in state_dict:
-                own = part_of(self, name)
-                own.data = own.data.new_empty(state_dict[prefix + name].shape)
+                place, _, last = name.rpartition(".")
+                owner, own = self.get_submodule(place), part_of(self, name)
+                empty = own.data.new_empty(state_dict[prefix + name].shape)
+                if isinstance(own, nn.Parameter):
+                    own.data = empty
+                else:
+                    setattr(owner, last, empty)  # a new tensor: caches know an index by its identity
         super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
 
 
