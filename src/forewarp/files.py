@@ -223,9 +223,9 @@ def read_rows(path: Path) -> list[dict[str, str]]:
     if not path.is_file():
         return []
     try:
-        with path.open(newline="") as file:
+        with path.open(newline="", encoding="utf-8", errors="replace") as file:
             return list(csv.DictReader(file))
-    except (csv.Error, ValueError) as error:  # NUL bytes, bytes that are no text
+    except (csv.Error, ValueError) as error:  # NUL bytes
         raise ValueError(f"{path}: expected a table, but got {short(str(error))}; delete it") from error
 
 

@@ -84,7 +84,7 @@ def test_synthetic_data_names_arguments_of_its_writer(name, tmp_path):
 
 def test_bad_arguments_leave_nothing(refused, in_tmp):
     line = refused("synthesize", "folder=s", "size=2")
-    assert line == "size: expected a whole number of at least 8, but got 2; set size"
+    assert line == "size: expected a whole number of at least 8, but got 2; set size=..."
     assert list(in_tmp.iterdir()) == []
 
 

@@ -189,6 +189,9 @@ def _numbers(array: object, where: str) -> np.ndarray:
 
 def _obj_vertices(path: Path, columns: int) -> np.ndarray:
     lines = read_bytes(path, MOST_POINTS).decode(errors="replace").splitlines()
-    words = {i: line.split() for i, line in enumerate(lines, 1)}
-    rows = [numbers_of(row[1:], columns, f"{path}: line {i}") for i, row in words.items() if row[:1] == ["v"]]
+    rows = [
+        numbers_of(line.split()[1:], columns, f"{path}: line {i}")
+        for i, line in enumerate(lines, 1)
+        if line.split(maxsplit=1)[:1] == ["v"]
+    ]
     return np.array(rows).reshape(-1, columns)

@@ -132,8 +132,11 @@ def one_of(value: object, where: str, *allowed: object, advice: str = "") -> Non
     >>> one_of("yes", "data.half", True, False, "auto")
     Traceback (most recent call last):
     forewarp.data.files.SceneError: data.half: expected true, false or auto, but got 'yes'
+    >>> one_of(1, "data.half", True, False)
+    Traceback (most recent call last):
+    forewarp.data.files.SceneError: data.half: expected true or false, but got 1
     """
-    if value not in allowed:
+    if not any(type(value) is type(each) and value == each for each in allowed):
         *texts, last = (json.dumps(each).strip('"') for each in allowed)  # as YAML writes them
         raise mismatch(where, f"{', '.join(texts)} or {last}", short(value), advice)
 
@@ -150,7 +153,7 @@ def whole(value: object, where: str, least: int, multiple: int = 1) -> int:
         is_good = False
     if not is_good:
         kind = "a whole number" if multiple == 1 else f"a multiple of {multiple}"
-        raise mismatch(where, f"{kind} of at least {least}", short(value), f"set {where}")
+        raise mismatch(where, f"{kind} of at least {least}", short(value), f"set {where}=...")
     return operator.index(value)
 
 

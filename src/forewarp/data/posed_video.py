@@ -173,9 +173,9 @@ def read_scene(
     if not by_name:
         parts, how = _split_entries(file, content, entries, test_every, absent)
     check_times({split: {e.name: given[e.name] for e in part} for split, part in parts.items()}, str(file))
-    near, far = length_of(near, "data.near"), length_of(far, "data.far")
+    near, far = length_of(near, "data.near"), length_of(far, "data.far", 1 / MOST_UNITS)
     near = length_of(content.get("near"), f"{file}: near") if near is None else near
-    far = length_of(content.get("far"), f"{file}: far") if far is None else far
+    far = length_of(content.get("far"), f"{file}: far", 1 / MOST_UNITS) if far is None else far
     bounds = _bounds(file, content, box)
     shown = (e for e in entries if e.load.mask or (e.is_cut_out and bool((e.load()[..., 3] < 255).any())))
     has_alpha = (first := next(shown, None)) is not None
@@ -318,14 +318,26 @@ def _read_entries(
         opaque = masks == "off" or (masks == "ignore" and mask is None)
         load = StoredImage(image.path, image.header.size, mask=None if valid else mask, opaque=opaque)
         has_mask.append(mask is not None)
-        name = _name_of(file.parent, entry.own["file_path"], entry.where("file_path"))
+        name = _name_of(file.parent, entry.own.get("file_path"), entry.where("file_path"))
         moving, resting = (_motion(image, key, scale) for key in ("moving_path", "resting_path"))
         taken_by = entry.own.get("camera")
         taken_by = str(taken_by) if type(taken_by) in (str, int) else None  # an object is another program's
         moment = whole(entry.own["moment"], entry.where("moment"), 0) if "moment" in entry.own else None
         depth = entry.path("depth_file_path") if "depth_file_path" in entry.own else None
-        beside = has_alpha and not opaque, valid, moving, resting, taken_by, moment, depth
-        entries.append(ImageEntry(*vars(image).values(), name, load, *beside))
+        entries.append(
+            ImageEntry(
+                **vars(image),
+                name=name,
+                load=load,
+                is_cut_out=has_alpha and not opaque,
+                valid=valid,
+                moving=moving,
+                resting=resting,
+                taken_by=taken_by,
+                moment=moment,
+                depth=depth,
+            )
+        )
     for key, given in (
         ("mask_path", has_mask),
         ("moving_path", [e.moving is not None for e in entries]),
@@ -342,7 +354,7 @@ def _read_entries(
             raise mismatch(f"{file}: frames", "each image once", f"{name} twice", "remove one")
     if axes is None:
         check_directions([e.camera.camera_to_world for e in entries], str(file), inverse=inverse)
-    listed = {_name_of(file.parent, frame["file_path"], f"{file}: frames") for frame in content["frames"]}
+    listed = {_name_of(file.parent, frame.get("file_path"), f"{file}: frames") for frame in content["frames"]}
     return entries, listed - {*names}, assumed
 
 
@@ -476,13 +488,14 @@ def write_scene(
 
 def _write_shot(folder: Path, shot: PosedShot, taken: set[str]) -> dict:
     """Write an image and make its entry; ``taken`` are the names so far, to which this one's is added."""
-    camera, stem, suffix = shot.camera, *os.path.splitext(shot.name)
+    camera = shot.camera
+    stem, suffix = os.path.splitext(shot.name)
     name = _name_of(folder, f"images/{shot.name}", f"shots: {shot.name!r}")
     one_of(suffix, f"{shot.name}: suffix", *SUFFIXES)
     if name in taken:
         raise mismatch(shot.name, "names that differ without their suffix", "two alike")
     taken.add(name)
-    if shot.split:
+    if shot.split != "":
         one_of(shot.split, f"{shot.name}: split", *SPLITS)
     if camera.skew:
         raise mismatch(shot.name, "a camera without skew", f"a skew of {camera.skew:g}")
