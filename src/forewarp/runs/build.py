@@ -196,11 +196,12 @@ def check_trainer(trainer: DictConfig) -> None:
         expected = "trainer.precision: expected 32-true or bf16-mixed, as float16 does not hold the gradients"
         raise ValueError(f"{expected}, but got {precision}; use trainer.precision=bf16-mixed")
     devices, nodes = trainer.get("devices", 1), str(trainer.get("num_nodes", 1))
-    count = devices if isinstance(devices, int | str | None) else len(devices)
+    count = len(devices) if OmegaConf.is_list(devices) or isinstance(devices, list | tuple) else devices
     if (str(count), nodes) != ("1", "1"):
         expected = "trainer.devices: expected 1, or the number of one GPU as [0]"
         got = f"{devices}" if nodes == "1" else f"{devices} on {nodes} nodes"
-        raise ValueError(f"{expected}, but got {got}; {instead_of('ddp')}")
+        advice = "one process trains a run, --multirun launcher=joblib trains several at once"
+        raise ValueError(f"{expected}, but got {got}; {advice}")
 
 
 def device_for(config: DictConfig) -> torch.device:

@@ -60,8 +60,15 @@ _NO_TRAINERS = dict.fromkeys(("ddp", "ddp_spawn", "ddp_sim", "fsdp", "deepspeed"
 _NO_TRAINERS["mps"] = "Apple's GPUs have no float64, which cameras and the cosine basis need: use trainer=cpu"
 _RESERVED = {"_target_", "_partial_", "_recursive_", "_convert_"}
 # What OmegaConf and PyYAML raise for a text that is no config.
-_UNREADABLE = (yaml.YAMLError, OmegaConfBaseException, ValueError, TypeError, AssertionError, ArithmeticError)
-_UNREADABLE += (RecursionError,)
+_UNREADABLE = (
+    yaml.YAMLError,
+    OmegaConfBaseException,
+    ValueError,
+    TypeError,
+    AssertionError,
+    OverflowError,
+    RecursionError,
+)
 _PARTS = {"name", "version", "sub_dir"}  # keys that make up the path a logger writes to
 # Its others.
 _PLAIN = {"default_hp_metric", "flush_logs_every_n_steps", "log_graph", "prefix"}
@@ -408,7 +415,7 @@ def _imported(parts: Sequence[str], refusal: str) -> object:
     try:
         found = importlib.import_module(parts[0])
         for i, part in enumerate(parts[1:], 2):
-            if not hasattr(found, part) and inspect.ismodule(found):
+            if not hasattr(found, part) and hasattr(found, "__path__"):
                 importlib.import_module(".".join(parts[:i]))
             found = getattr(found, part)
         return found
