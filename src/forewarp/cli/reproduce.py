@@ -361,8 +361,13 @@ def _call(name: str, arguments: list[str], prefix: str = "") -> int:
     command = [str(Path(sys.executable).with_name(f"forewarp-{name}")), *arguments]
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT} if prefix else {}
     with subprocess.Popen(command, text=True, **pipes) as process:
-        for line in process.stdout or ():
-            print(f"{prefix}{line}", end="", flush=True)
+        try:
+            for line in process.stdout or ():
+                print(f"{prefix}{line}", end="", flush=True)
+            process.wait()
+        except BaseException:  # leave no command behind
+            process.kill()
+            raise
     if process.returncode < 0 or process.returncode >= 128:
         raise KeyboardInterrupt
     return process.returncode
