@@ -105,10 +105,12 @@ def check(config) -> tuple[dict, object]:
     needs |= {key: "videos" for key, value in RIG.items() if config[key] != value}
     for key, needed in needs.items():
         if needed != given[0]:
-            raise ValueError(f"{key}: expected {needed}=FOLDER beside it, but got {given[0]}=; remove it")
-    for key, nothing in (("force", bool), ("fixed", type(None))):
-        if type(config[key]) not in (bool, nothing):
-            raise ValueError(f"{key}: expected true or false, but got {config[key]}")
+            advice = "set images=" if key == "colmap" else "remove it"
+            raise ValueError(f"{key}: expected {needed}=FOLDER beside it, but got {given[0]}=; {advice}")
+    if type(config.force) is not bool:
+        raise ValueError(f"force: expected true or false, but got {config.force}")
+    if type(config.fixed) not in (bool, type(None)):
+        raise ValueError(f"fixed: expected true, false or null, but got {config.fixed}")
     if config.rate is not None and not (type(config.rate) in (int, float) and 0 < config.rate < 1e6):
         raise ValueError(f"rate: expected pictures a second, above 0, but got {config.rate}")
     if isinstance(name := config.without, str):
@@ -137,7 +139,7 @@ def check(config) -> tuple[dict, object]:
         place, ours = out.resolve(), path and path.resolve()
         inside = key in ("videos", "images", "masks") and ours and place.is_relative_to(ours)
         if inside or (ours and ours.is_relative_to(place)):
-            expected = f"out: expected a folder neither in one that is read nor around one, but got {out}"
+            expected = f"out: expected a folder apart from what is read, but got {out}"
             raise ValueError(f"{expected} with {key}={path}; set out=...")
     if (out / MARKERS["posed_video"]).exists() and not config.overwrite:
         raise ValueError(f"{out}: expected a new folder, but got a scene; set overwrite=true or out=...")
