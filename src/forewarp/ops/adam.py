@@ -50,7 +50,9 @@ def adam_rows(states: Sequence[AdamState], betas: tuple[float, float], eps: floa
     """
     fast = []
     for state in states:
-        check_shapes(_SHAPES, *state[:5])
+        shape = state.value.shape
+        if any(t.shape != shape for t in state[1:4]) or state.steps.shape != shape[:-1]:
+            check_shapes(_SHAPES, *state[:5])  # says which
         if _fits_kernel(state):
             fast.append(state)
         else:
