@@ -237,7 +237,7 @@ def test_a_step_of_the_method(name, monkeypatch):
         assert float((gradient * direction).sum()) == pytest.approx(expected, rel=1e-5, abs=1e-7), which
 
 
-OF_PARTICLES = {"project", "backward", "rasterize", "nodes", "adam"}
+OF_PARTICLES = {"project", "rasterize", "nodes", "adam"}
 
 
 @pytest.mark.slow

@@ -238,10 +238,10 @@ def synthesize_iphone(
             film = movers.Film(next(images))
             for t in moments:
                 rgb, moving = film.add(*next(images))
-                counted = counts.copy()
+                shown_by = counts.copy()
                 surface = _seen_by(world, times[t], phone, np.flatnonzero(moving))
-                counted[moving] = movers.views_of(world, times, cameras, *surface)
-                covisible = counted > max(LEAST_VIEWS, int(LEAST_SHARE * frames))
+                shown_by[moving] = movers.views_of(world, times, cameras, *surface)
+                covisible = shown_by > max(LEAST_VIEWS, int(LEAST_SHARE * frames))
                 yield RigShot(f"{k}_{t:05d}", t, k, "val", phone, rgb, covisible=covisible)
 
     low, high, near, far = _space_of(world, times, cameras)

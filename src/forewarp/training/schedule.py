@@ -215,10 +215,12 @@ class Curriculum:
         where: str = "stage.curriculum",
     ) -> None:
         shares = {"all_in": all_in, "newest_share": newest_share, "error_share": error_share}
-        shares |= {"ends_share": ends_share, "newest_part": newest_part}
-        if not (start >= 1 and all(0 <= share <= 1 for share in shares.values()) and newest_part > 0):
-            expected = f"{where}: expected start >= 1, {', '.join(shares)} in [0, 1] and newest_part > 0"
-            raise ValueError(f"{expected}, but got {start=}, {shares}")
+        shares |= {"ends_share": ends_share}
+        if not (start >= 1 and all(0 <= share <= 1 for share in shares.values()) and 0 < newest_part <= 1):
+            expected = "expected start >= 1, newest_part in (0, 1]"
+            expected = f"{where}: {expected}, {', '.join(shares)} in [0, 1]"
+            got = ", ".join(f"{name}={value}" for name, value in shares.items())
+            raise ValueError(f"{expected}, but got {start=}, {newest_part=}, {got}")
         self.canonical_time = canonical_time
         self.order = sorted(range(len(times)), key=lambda i: (abs(times[i] - canonical_time), times[i], i))
         last_of_time = {times[i]: place for place, i in enumerate(self.order)}

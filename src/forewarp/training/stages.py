@@ -200,10 +200,20 @@ class Run:
         settings, objective = stage.settings.over(len(scene.train)), stage.objective
         options = {"seed": seed, "where": f"stage.{settings.name}.curriculum", **settings.curriculum}
         curriculum = Curriculum(instants_of(scene.train), scene.canonical_time, **options)
-        carried = handover, None if before is None else before.method, blank
-        terms = objective.weights, objective.literal, objective.photo_on
-        given = scene, settings.name, settings.numbers, curriculum.frames(), *carried, *terms
-        method = (stage.model or self.model)(Start(*given, shares=self.start is not None))
+        start = Start(
+            scene,
+            settings.name,
+            settings.numbers,
+            frames=curriculum.frames(),
+            handover=handover,
+            before=None if before is None else before.method,
+            blank=blank,
+            weights=objective.weights,
+            literal=objective.literal,
+            photo_on=objective.photo_on,
+            shares=self.start is not None,
+        )
+        method = (stage.model or self.model)(start)
         return DynamicSceneModule(
             method, objective=objective, settings=settings, curriculum=curriculum, seed=seed
         )

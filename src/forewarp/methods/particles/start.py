@@ -386,7 +386,7 @@ def _holes(image: tuple[Tensor, Tensor, Camera], side: int, before: Tensor) -> t
     """
     rgb, valid, camera = image
     step = max(1, round(max(camera.width, camera.height) / side))
-    first = (min(step // 2, side - 1) for side in (camera.height, camera.width))
+    first = (min(step // 2, length - 1) for length in (camera.height, camera.width))
     rows, columns = _every(step, camera, *first)
     rays = camera.rays(rows * camera.width + columns)
     is_hole = _in_holes(before, rays.origins + rays.directions, camera, side)

@@ -224,9 +224,11 @@ class VoxelMethod(Method):
         return VoxelSnapshot(moment, fields, canonical, self.renderer, shade, background=static, **found)
 
     @classmethod
-    def check(cls, stage: str, numbers: Mapping[str, Any], *names: Iterable[str]) -> None:
+    def check(
+        cls, stage: str, numbers: Mapping[str, Any], terms: Iterable[str], literal: Iterable[str] = ()
+    ) -> None:
         """See ``Method.check``; also refuse numbers out of range."""
-        super().check(stage, numbers, *names)
+        super().check(stage, numbers, terms, literal)
         if numbers:
             VoxelStage(name=stage, **numbers)
 
