@@ -439,6 +439,15 @@ def test_alpha_counts_where_it_says_something(tmp_path, made):
     assert read_scene(tmp_path, "solid").has_alpha
 
 
+def test_a_frame_without_a_path_and_a_shot_without_a_split_are_refused(tmp_path):
+    write_video(tmp_path / "toy")
+    edit(tmp_path / "toy" / FILE, {"file_path": "images/frame_1.png", "frames.0.file_path": GONE})
+    with refused("file_path: expected a path inside the scene folder, but got None"):
+        read_scene(tmp_path, "toy")
+    with refused("split: expected train, val or test, but got None"):
+        write_scene(tmp_path / "new", [replace(next(posed_shots()), split=None)], near=20, far=120)
+
+
 @pytest.mark.parametrize("suffix", [".jpeg", ".JPG", ".PNG"])
 def test_images_are_written_and_read_with_and_without_their_suffix(tmp_path, suffix):
     smooth = np.full((20, 30, 3), 0, np.uint8) + np.arange(30, dtype=np.uint8)[:, None] * 8

@@ -132,11 +132,12 @@ def test_a_checkpoint_brings_its_own_lattice():
     source = numbered(THIRD)
     source.resample(Lattice(LATTICE.box, (4, 4, 3)), torch.ones(4, 4, 3, dtype=torch.bool), {"density": 0.0})
     stored, loaded = holding(source), holding(numbered(ALL))
-    parameter = loaded.grid.density
+    parameter, index = loaded.grid.density, loaded.grid.index
     assert loaded.misfit(stored.state_dict()) is None
     loaded.load_state_dict(stored.state_dict())
     assert loaded.grid.lattice == source.lattice
     assert loaded.grid.density is parameter  # an optimiser may hold it
+    assert loaded.grid.index is not index  # caches of what is read know it by its identity
     for name, value in source.state_dict().items():
         if torch.is_tensor(value):
             assert torch.equal(loaded.grid.state_dict()[name], value)

@@ -109,7 +109,13 @@ def test_float16_is_refused(precision):
 @pytest.mark.parametrize(
     ("devices", "nodes", "got"),
     [(1, 1, None), ("1", 1, None), ([0], 1, None), ([3], 1, None), (2, 1, "2"), ("auto", 1, "auto")]
-    + [(-1, 1, "-1"), ([0, 1], 1, r"\[0, 1\]"), (1, 2, "1 on 2 nodes")],
+    + [
+        (-1, 1, "-1"),
+        ([0, 1], 1, r"\[0, 1\]"),
+        (1, 2, "1 on 2 nodes"),
+        (1.5, 1, "1.5"),
+        ({"a": 1}, 1, "{'a': 1}"),
+    ],
 )
 def test_one_process_trains_a_run(devices, nodes, got):
     trainer = OmegaConf.create({"devices": devices, "num_nodes": nodes})
