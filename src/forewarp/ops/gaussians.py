@@ -595,8 +595,9 @@ def compare(
 
 
 def compare_reference(
-    seen: tuple, pixels, background, width, factor, by_skin, kinds, loss, valid, sensed, by_depth, deep, chunk
-) -> ImageLoss:
+    seen: tuple, pixels, background, width, factor, by_skin, kinds, loss=None, valid=None, sensed=None,
+    by_depth=1.0, deep=DEEP, chunk=CHUNK,
+) -> ImageLoss:  # fmt: skip
     """``compare`` in plain PyTorch, on any device and in any precision; a ``loss`` by ``project`` and
     ``rasterize``, which use kernels. ``seen`` are the arguments of ``project``.
     """
