@@ -220,6 +220,14 @@ def test_departures_and_faults_are_those_of_the_publication(make, departures, fa
 
 
 @torch.no_grad()
+def test_nerf_draws_the_same_image_at_all_times():
+    made, view = skipping("nerf"), View(camera())
+    first, later = (made.at(Moment(time)).render(view, WHITE) for time in (0.0, 0.7))
+    assert first.rgb.equal(later.rgb)
+    assert first.depth.equal(later.depth)
+
+
+@torch.no_grad()
 def give_without(template, other, columns):
     """Give a template the weights of another that reads more channels, without these columns of its input."""
     state, shapes = dict(other.state_dict()), template.state_dict()

@@ -545,3 +545,14 @@ def test_the_fused_loss_is_that_of_a_callable(kind):
     close_in_norm(gradients_of(fused), gradients_of(called), 2e-5)
     assert called.order.tolist() == fused.order.tolist()
     assert torch.equal(called.distances[called.order], fused.distances[fused.order])
+
+
+def test_gradients_of_a_loss_of_neighbouring_pixels():
+    """By the kernels, against the reference in float64."""
+
+    def edges(image, truth):
+        return (image.diff(dim=1) - truth.diff(dim=1)).square().sum()
+
+    exact, fast = (run(kind, loss=edges) for kind in (F64, F32))
+    assert fast.loss == pytest.approx(exact.loss, rel=1e-5)
+    close_in_norm(gradients_of(exact), gradients_of(fast), 2e-5)
