@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import errno
 import glob
+import io
 import json
 import os
 import secrets
@@ -223,8 +224,7 @@ def read_rows(path: Path) -> list[dict[str, str]]:
     if not path.is_file():
         return []
     try:
-        with path.open(newline="", encoding="utf-8", errors="replace") as file:
-            return list(csv.DictReader(file))
+        return list(csv.DictReader(io.StringIO(read_text(path), newline="")))
     except (csv.Error, ValueError) as error:  # NUL bytes
         raise ValueError(f"{path}: expected a table, but got {short(str(error))}; delete it") from error
 
