@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from forewarp.fields.moving import cosines
 from forewarp.methods.particles.shared import left_alone
 from forewarp.methods.rows import take_rows
 from forewarp.ops.gaussians import moved, rotations
@@ -122,7 +123,8 @@ def most_opaque(particles: Particles) -> Tensor:
     base = particles.opacity.data[:, 0]
     if particles.opacity_over_time is None:
         return base
-    bases = torch.stack([particles.time_bases(i / _TIMES)[1][1:] for i in range(_TIMES + 1)])  # (T, F)
+    count, canonical = particles.opacity_over_time.shape[1], particles.canonical_time
+    bases = base.new_tensor([cosines(count, i / _TIMES, canonical) for i in range(_TIMES + 1)])  # (T, F)
     return base + (bases @ particles.opacity_over_time.data.T).amax(0)
 
 
