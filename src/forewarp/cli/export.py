@@ -126,9 +126,8 @@ def check(config, windows: int = 1) -> list[float]:
         raise ValueError(f"format: expected one of {', '.join(FORMATS)}, but got '{config.format}'")
     form, name = FORMATS[config.format], f"format={config.format}"
     if windows > 1 and form.times:
-        raise ValueError(
-            f"format: expected glb or html for a film's windows, but got {config.format}; export one"
-        )
+        expected = "format: expected glb or html for a film's windows"
+        raise ValueError(f"{expected}, but got {config.format}; export one of them")
     foreign = {option for other in FORMATS.values() for option in other.options} - set(form.options)
     for key in map(key_of, typed_overrides()):
         if key == "times" and not form.times:

@@ -202,17 +202,19 @@ def _of_hydra(said: str) -> str | None:
     if not (absent := re.search(r"Could not (?:find|load) '([\w/]+)/([^'/]+)'", said)):
         return None
     group, word = absent.groups()
-    if group == "trainer":
+    if group.partition("/")[0] == "trainer":
+        word = f"{group}/{word}".partition("/")[2]
         from forewarp.runs.config import instead_of
 
         return f"trainer: expected auto, cpu or gpu, but got {word}; {instead_of(word)}"
     from forewarp.runs.sections import option_groups
 
-    said = said.split("Config search path")[0]
+    said = flat(text := said.split("Config search path")[0])
     known = option_groups(configurations(), *installed().values()).get(group, [])
-    listed = f" Available options in '{group}': {'; '.join(known)}" if "Available" not in said else ""
-    near = difflib.get_close_matches(word, [*known, *re.findall(r"^\t(\S+)$", said, re.M)], 1)
-    return flat(said) + listed * bool(known) + (f"; did you mean {near[0]}?" if near else "")
+    if known and "Available" not in said:
+        said += f" Available options in '{group}': {'; '.join(known)}"
+    near = difflib.get_close_matches(word, [*known, *re.findall(r"^\t(\S+)$", text, re.M)], 1)
+    return said + (f"; did you mean {near[0]}?" if near else "")
 
 
 def _to_install(error: ImportError) -> str:

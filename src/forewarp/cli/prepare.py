@@ -16,7 +16,7 @@ from omegaconf import DictConfig
 
 from forewarp.cli.mistakes import of_another
 from forewarp.cli.view import require_viewer
-from forewarp.data.files import MARKERS, number, scene_folder, whole
+from forewarp.data.files import number, scene_folder, whole
 from forewarp.files import MOST_CONFIG, read_text, replace_file
 from forewarp.runs.config import check_planned, check_values, hashed, is_swept, resumed, trust_of
 from forewarp.runs.overrides import key_of, typed_overrides
@@ -25,6 +25,15 @@ if TYPE_CHECKING:  # loads torch
     from forewarp.runs.fitted import Score
     from forewarp.training.stages import Run
 
+# What our data modules read; those of others, and those that make their scene, check for themselves.
+READERS = {
+    "DNeRFDataModule": "dnerf",
+    "LegoCompleteDataModule": "lego_complete",
+    "HyperNeRFDataModule": "hypernerf",
+    "NHRDataModule": "nhr",
+    "MulticamDataModule": "multicam",
+    "PosedVideoDataModule": "posed_video",
+}
 VOXELS, PARTICLES = "forewarp.methods.voxel.", "forewarp.methods.particles."
 
 CHOICES = {"effects": ("given", "auto"), "absent": ("refuse", "skip")}
@@ -148,9 +157,7 @@ def refuse_missing_scene(config: DictConfig) -> None:
     Raises:
         SceneError: listing the scenes that are there.
     """
-    readers = {f"forewarp.data.module.{reader}datamodule".replace("_", ""): reader for reader in MARKERS}
-    # Data modules of others, and those that make their scene, check for themselves.
-    reader = readers.get(str(config.data.get("_target_")).lower())
+    reader = READERS.get(str(config.data.get("_target_")).removeprefix("forewarp.data.module."))
     if reader is not None and config.get("absent", "refuse") == "refuse":
         scene_folder(Path(config.data.root).expanduser(), str(config.data.scene), reader)
 

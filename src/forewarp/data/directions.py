@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from functools import reduce
 from itertools import combinations
 
 import torch
@@ -94,7 +93,9 @@ def other_readings(poses: Sequence[torch.Tensor], changes: Mapping[str, _Change]
         return []
     for count in range(1, len(changes) + 1):
         for names in combinations(changes, count):
-            changed = reduce(lambda poses, name: changes[name](poses), names, poses)
+            changed = poses
+            for name in names:
+                changed = changes[name](changed)
             miss, ahead, _ = _meeting(changed)
             ways += [" and ".join(names)] if miss < _MEET and ahead == 1 else []
         if ways:

@@ -61,7 +61,6 @@ from forewarp.scene.camera import Camera
 from forewarp.scene.frame import Frame, Scene, middle_of
 
 FILE, POINTS = "transforms.json", "points.npy"
-
 SCALES = (1, 2, 4, 8)
 _OF_CAMERA = ("w", "h", "fl_x", "fl_y", "cx", "cy", "camera_model", "k1", "k2", "k3", "p1", "p2")
 

@@ -446,9 +446,9 @@ def _indices(grid: VoxelGrid, strides: tuple[int, ...], padded: bool) -> tuple[T
     known = getattr(grid, "_strided", None)
     if known is None or known[0] is not grid.index or known[1] != (strides, padded):
         missing = [(1 - n) % strides[-1] for n in grid.index.shape]
-        if not padded:
-            wanted, shape = f"sizes of {strides[-1]} k + 1", tuple(grid.index.shape)
-            check_value("a strided grid", shape, wanted, lambda _: not any(missing))
+        if any(missing) and not padded:
+            got = tuple(grid.index.shape)
+            raise ValueError(f"a strided grid: expected sizes of {strides[-1]} k + 1, but got {got}")
         ends = [end for more in reversed(missing) for end in (0, more)]
         index = torch.nn.functional.pad(grid.index, ends, value=-1)
         known = grid.index, (strides, padded), (index, [index[::s, ::s, ::s].contiguous() for s in strides])

@@ -76,8 +76,8 @@ class DNeRF(SampledMethod):
 
     def departures(self) -> list[str]:
         """See ``SampledMethod``."""
-        return super().departures() + [NO_JUMP] * self.continuous
+        return super().departures() + ([NO_JUMP] if self.continuous else [])
 
     def faults(self) -> list[str]:
         """See ``Method``."""
-        return super().faults() + [JUMP] * (not self.continuous)
+        return super().faults() + ([] if self.continuous else [JUMP])

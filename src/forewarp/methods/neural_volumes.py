@@ -15,7 +15,6 @@ from torch.nn import functional
 from forewarp.fields.networks import beside, start_as_glorot
 from forewarp.methods.method import Start, Step, check_number, those_that_hold
 from forewarp.methods.rays import BETWEEN_TIMES, CENTRES, ONE_TIME, DeadStart, RayMethod, RaySnapshot
-from forewarp.ops.backend import check_value
 from forewarp.ops.gaussians import rotations
 from forewarp.ops.march import clip_to_box
 from forewarp.renderer import in_chunks
@@ -49,9 +48,9 @@ class PictureEncoder(nn.Module):
     ) -> None:
         super().__init__()
         by = 2 ** len(tower)
-        wanted = f"height and width in multiples of {by}, as the tower halves {len(tower)} times"
-        good = len(size) == 2 and min(size) >= by and not any(side % by for side in size)
-        check_value("model.picture_size", list(size), wanted, lambda _: good)
+        if len(size) != 2 or min(size) < by or any(side % by for side in size):
+            wanted = f"height and width in multiples of {by}, as the tower halves {len(tower)} times"
+            raise ValueError(f"model.picture_size: expected {wanted}, but got {list(size)}")
         steps = list(zip((3, *tower[:-1]), tower))
         self.towers = nn.ModuleList()
         for _ in range(pictures):

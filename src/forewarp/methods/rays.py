@@ -188,7 +188,7 @@ class Sampling:
         check_number("model.sampling.hull", self.hull, *FRACTION)
         check_least(of="model.sampling", occupancy=self.occupancy)
         known = ("relu", "softplus")
-        check_value("model.sampling.density", self.density, " or ".join(known), known.__contains__)
+        check_value("model.sampling.density", self.density, " or ".join(known), lambda kind: kind in known)
 
     def departures(self, density: str, jitters: bool) -> list[str]:
         """List what differs from a publication's density, and whether it ``jitters`` samples in images."""

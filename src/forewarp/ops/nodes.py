@@ -10,6 +10,7 @@ from forewarp.ops.backend import arrays, check_shapes, match_threads, use_numba
 LEAST = 1e-20  # the sum of a particle's weights is divided by this at least: that of one at rest is 0
 _WIDEST = 16  # nodes of a particle that the kernel knows
 _EDGES = "motion (M, 6), places (M, 3), edges (M, E), weights (M, E)"
+_PULLED = f"{_EDGES}, by_maps (M, 12)"
 _SMALL = 0.05  # radian; below, series in the squared angle are exact to single precision
 
 
@@ -119,7 +120,7 @@ def pull_nodes(
 
     Cost: about 60 operations an edge.
     """
-    check_shapes(f"{_EDGES}, by_maps (M, 12)", motion, places, edges, weights, by_maps)
+    check_shapes(_PULLED, motion, places, edges, weights, by_maps)
     if use_numba(motion) and motion.dtype == torch.float32:
         from forewarp.ops.kernels import nodes as kernels
 

@@ -466,7 +466,8 @@ def _check_logger(node: dict, where: Path, key: str) -> None:
         raise ValueError(f"{where}: {key}.tracking_uri: expected null, but got {got}; {advice}")
     if others := sorted(node.keys() - _PARTS - _PLAIN - _RESERVED - {"tracking_uri"}):
         known = ", ".join(sorted(_PARTS | _PLAIN))
-        raise ValueError(f"{where}: {key}.{others[0]}: expected one of {known}; delete it")
+        expected = f"{where}: {key}.{others[0]}: expected one of {known}"
+        raise ValueError(f"{expected}, but got another option; delete it")
     for name in sorted(_PARTS & node.keys()):
         if not re.fullmatch(r"(\w[\w.-]*)?", str(node[name])):
             got = f"{node[name]!r:.80}"

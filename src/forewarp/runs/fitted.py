@@ -235,8 +235,14 @@ def open_file(file: Path, device: str = "cpu") -> SceneFile:
     """Open a ``scene.glb``; see ``forewarp.load``."""
     held = read(file)
     setting = held.setting
-    about = "particles", file, list(setting.cameras), torch.tensor(setting.background), setting.seconds
-    return SceneFile(held.gaussians.to(device), *about)
+    return SceneFile(
+        method=held.gaussians.to(device),
+        name="particles",
+        place=file,
+        cameras=list(setting.cameras),
+        background=torch.tensor(setting.background),
+        seconds=setting.seconds,
+    )
 
 
 def opened(config: DictConfig, device: str | torch.device | None = None) -> tuple[Run, DynamicSceneModule]:
@@ -276,9 +282,17 @@ def open_run(
     changes = {"trust": list(trust_of(trust)), "data": {"root": root}}
     config = saved_config(str(run), OmegaConf.create(changes))
     made, module = opened(config, device)
-    scene, background = made.datamodule.scene, made.datamodule.targets("test").background
-    cameras = [frame.camera for frame in scene.train]
-    return Fitted(module.method, config.model.name, run, cameras, background, config, module, scene)
+    scene = made.datamodule.scene
+    return Fitted(
+        method=module.method,
+        name=config.model.name,
+        place=run,
+        cameras=[frame.camera for frame in scene.train],
+        background=made.datamodule.targets("test").background,
+        config=config,
+        module=module,
+        scene=scene,
+    )
 
 
 def measure_run(run: Run, module: DynamicSceneModule, config: DictConfig) -> dict:
@@ -302,8 +316,9 @@ def measure_run(run: Run, module: DynamicSceneModule, config: DictConfig) -> dic
 
 def log_scores(run: Run, metrics: dict) -> None:
     """Log the scores of ``metrics.json`` to the run's loggers, as ``test/space/psnr``."""
-    rows = ((split, *row) for split, of in metrics["test"].items() for row in of.items())
-    scores = {f"test/{split}/{name}": score for split, name, score in rows}
+    scores = {
+        f"test/{split}/{name}": score for split, of in metrics["test"].items() for name, score in of.items()
+    }
     scores |= {"test/seconds": sum(metrics["seconds"].values())}
     run.loggers.log_scores(scores, sum(done["steps"] for done in run.finished().values()))
 

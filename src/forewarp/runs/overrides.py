@@ -81,20 +81,23 @@ def as_text(arguments: Sequence[str]) -> list[str]:
     >>> as_text(["data.scene=null", "data.scene={a}", "run=[a]", "runs=[a]"])
     ["data.scene='null'", "data.scene='{a}'", "run='[a]'", 'runs=[a]']
     """
-    swept = bool({"-m", "--multirun"} & set(arguments))
-
-    def quoted(argument: str) -> str:
+    swept, found = bool({"-m", "--multirun"} & set(arguments)), []
+    for argument in arguments:
         key, _, value = argument.partition("=")
-        name, is_scene = key_of(argument), key_of(argument) == "data.scene"
-        # What Hydra's grammar has: text in quotes, interpolations, null and lists.
-        hydras = r"(['\"]).*\1|\$\{.*" + r"|null" * (not is_scene) + r"|\[.*" * (name in LISTS)
-        if not value or not TEXTS.fullmatch(name) or re.fullmatch(hydras, value, re.S):
-            return argument
-        if (swept or is_scene) and is_sweep(argument):
-            return argument
-        return text_override(key, value if is_scene or value[:2] != "~/" else os.path.expanduser(value))
+        name = key_of(argument)
+        typed = TEXTS.fullmatch(name) and value and not _is_of_hydra(name, value)
+        several = typed and (swept or name == "data.scene") and is_sweep(argument)
+        if typed and name != "data.scene" and value.startswith("~/"):
+            value = os.path.expanduser(value)
+        found.append(text_override(key, value) if typed and not several else argument)
+    return found
 
-    return [quoted(argument) for argument in arguments]
+
+def _is_of_hydra(key: str, value: str) -> bool:
+    """Tell whether a path or name was typed as Hydra's grammar has it."""
+    is_quoted = len(value) > 1 and value[0] == value[-1] and value[0] in "'\""
+    is_null, is_list = value == "null" and key != "data.scene", value[0] == "[" and key in LISTS
+    return is_quoted or is_null or is_list or value.startswith("${")
 
 
 def parsed(override: str):

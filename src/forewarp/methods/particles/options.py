@@ -146,7 +146,7 @@ class Numbers:
         shares = "initial_share", "final_share", "density_interval", "rigid_final_factor"
         decays = "opacity_decay", "crowd_decay", "hidden_decay"
         others = "density_until", "rest_from", "jitter", "time_offsets"
-        for keys, *wanted in (
+        for keys, wanted, good in (
             (shares, "a number in (0, 1]", lambda value: 0 < value <= 1),
             (decays, "a number in [0, 1)", lambda value: 0 <= value < 1),
             (("density", "nodes", "knots", "jitter_until"), "a number > 0", lambda value: value > 0),
@@ -155,7 +155,7 @@ class Numbers:
             (("shell",), "0 or a number >= 1", lambda value: value == 0 or value >= 1),
         ):
             for key in keys:
-                check_number(f"{where}.{key}", getattr(self, key), *wanted)
+                check_number(f"{where}.{key}", getattr(self, key), wanted, good)
 
     def final_count(self, covered_pixels: float, views: int) -> int:
         """Return how many particles there are in the end.

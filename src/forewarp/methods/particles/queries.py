@@ -27,7 +27,7 @@ _ALIKE = 9  # particles beside each other, whose median counts
 
 
 class Queries(Method):
-    """What others ask of ``Particles``; see ``methods.method``."""
+    """Scene queries of ``Particles``; see ``methods.method``."""
 
     @torch.no_grad()
     def moving(self) -> MovingGaussians:

@@ -91,7 +91,7 @@ class VoxelStage:
             steps_of(f"{where}.{key}", getattr(self, key))
         check_effects(f"{where}.effects", self.effects, NAMES)
         starts = ("auto", "box", "hull")
-        check_value(f"{where}.start", self.start, "auto, box or hull", starts.__contains__)
+        check_value(f"{where}.start", self.start, "auto, box or hull", lambda kind: kind in starts)
         check_number(f"{where}.confine", self.confine, *FRACTION)
         for key in ("box_alpha", "start_alpha"):
             check_number(f"{where}.{key}", getattr(self, key), "a number in (0, 1)", lambda a: 0 < a < 1)
