@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
+from functools import partial
 from pathlib import Path
 
 import lightning
@@ -58,30 +59,23 @@ def diagnose(module: DynamicSceneModule, batch: Batch, number: int) -> str | Non
     if step.gradients is not None:  # the method's own, of all terms together
         name = first_bad(step.gradients.items(), squared=True)
         return name and f"gradient: {name}"
-    gradients = {name: _gradients(value * factor, parameters) for name, (value, factor) in terms.items()}
-    sums = {p: sum(g[p] for g in gradients.values() if g[p] is not None) for p in parameters}
-    name = first_bad(((p, g) for p, g in sums.items() if torch.is_tensor(g)), squared=True)
-    if name is None:
+    learn = {name: value * factor for name, (value, factor) in terms.items() if value.requires_grad}
+    gradients_of = partial(torch.autograd.grad, retain_graph=True, allow_unused=True)
+    by_all = gradients_of(list(learn.values()), list(parameters.values())) if learn else ()
+    if (name := first_bad(zip(parameters, by_all), squared=True)) is None:
         return None
-    guilty = [term for term, g in gradients.items() if first_bad([("", g[name])], squared=True) is not None]
+    by_term = [(term, *gradients_of(value, parameters[name])) for term, value in learn.items()]
+    guilty = [term for term, gradient in by_term if first_bad([(term, gradient)], squared=True)]
     return f"gradient: {name}" + (f" (terms {', '.join(guilty)})" if guilty else "")
-
-
-def _gradients(value: Tensor, parameters: dict[str, Tensor]) -> dict[str, Tensor | None]:
-    if not value.requires_grad:
-        return dict.fromkeys(parameters)
-    by_parameter = torch.autograd.grad(value, list(parameters.values()), retain_graph=True, allow_unused=True)
-    return dict(zip(parameters, by_parameter))
 
 
 def _inputs(batch: Batch) -> Iterable[tuple[str, Tensor | None]]:
     """Yield the colours and rays of a batch by name."""
     for number, seen in enumerate(batch.observations):
         rays = seen.view.rays()
-        yield f"batch[{number}].rgb", seen.rgb
-        yield f"batch[{number}].background", seen.background
-        yield f"batch[{number}].rays.origins", rays.origins
-        yield f"batch[{number}].rays.directions", rays.directions
+        named = {"rgb": seen.rgb, "background": seen.background}
+        named |= {"rays.origins": rays.origins, "rays.directions": rays.directions}
+        yield from ((f"batch[{number}].{name}", tensor) for name, tensor in named.items())
 
 
 class Sentinel(lightning.Callback):
