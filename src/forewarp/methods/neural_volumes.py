@@ -332,16 +332,13 @@ class NeuralVolumes(RayMethod):
         volumes = self.volumes(mean + deviation.exp() * noise)
         seen = self.march(volumes, rays, background, self._tints(batch), generator)
         self.dead_start.look(bool(((seen.opacity > 0) & (seen.opacity < 1)).any()))
-        error = (seen.rgb - rgb.to(seen.rgb)).square().mean()
         terms = {
-            "photo": lambda: error,
             "code_prior": lambda: code_prior(mean, deviation),
             "opacity_prior": lambda: opacity_prior(seen.opacity),
             "opacity_variation": lambda: opacity_variation(volumes.template[3]),
         }
         tensors = {"code": mean, "template": volumes.template, "warp": volumes.warp, "rgb": seen.rgb}
-        noted = {"opacity": float(seen.opacity.detach().mean())}
-        return Step(terms, error.detach(), noted, tensors=tensors.items)
+        return self.compared(seen, rgb, terms, tensors)
 
     def _tints(self, batch: Batch) -> Tensor | None:
         if self.gain is None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -84,10 +84,6 @@ class DeadStart:
             )
 
 
-def _named(rendering: Rendering, *names: str) -> Iterator[tuple[str, Tensor]]:
-    return ((name, getattr(rendering, name)) for name in names)
-
-
 class RayMethod(Method):
     """A method that answers for any rays at a moment, without computing anything for the moment before.
 
@@ -112,6 +108,16 @@ class RayMethod(Method):
             rays, _, background = part.joined()
             parts.append((part.observations[0].moment, rays.to(self.device), background.to(self.device)))
         return parts
+
+    def compared(
+        self, seen: Rendering, rgb: Tensor, terms: Terms, tensors: Mapping[str, Tensor], **noted: float
+    ) -> Step:
+        """Return the answer to a batch of ``rgb`` (R, 3): ``photo``, the error of what is ``seen``, and these
+        ``terms``; ``tensors`` by name, and what is ``noted`` beside the mean opacity: see ``Step``.
+        """
+        error = (seen.rgb - rgb.to(seen.rgb.device)).square().mean()
+        noted["opacity"] = float(seen.opacity.detach().mean())
+        return Step({"photo": lambda: error} | terms, error.detach(), noted, tensors=tensors.items)
 
     def at(self, moment: Moment) -> RaySnapshot:
         """Fix the time; compute nothing yet."""
@@ -300,13 +306,11 @@ class SampledMethod(RayMethod):
         seen = Sampled.joined([self.along(*part, generator) for part in self.parts_of(batch)])
         passes = [seen] if seen.coarse is None else [seen.coarse, seen]
         self.dead_start.look(all(bool((rendering.density > 0).any()) for rendering in passes))
-        error = (seen.rgb - rgb).square().mean()
-        terms = {"photo": lambda: error}
+        terms = self.extra_terms(seen, batch, generator)
         if "coarse_photo" in self.terms:
             terms["coarse_photo"] = lambda: seen.coarse and (seen.coarse.rgb - rgb).square().mean()
-        terms |= self.extra_terms(seen, batch, generator)
-        noted = {"samples": seen.depths.numel(), "opacity": float(seen.opacity.detach().mean())}
-        return Step(terms, error.detach(), noted, tensors=lambda: _named(seen, "density", "weights", "rgb"))
+        tensors = {"density": seen.density, "weights": seen.weights, "rgb": seen.rgb}
+        return self.compared(seen, rgb, terms, tensors, samples=seen.depths.numel())
 
     def advance(self, progress: float, step: int, optimizer: torch.optim.Optimizer) -> dict[str, float]:
         """See ``Method``; look now and then for where matter is."""
@@ -538,15 +542,13 @@ class MarchedMethod(RayMethod):
         parts = [(self.field(moment), *part) for moment, *part in self.parts_of(batch)]
         drawn = Marched.joined([self.marched(*part, jitter) for part in parts])
         self.dead_start.look(len(drawn.weights) > 0)
-        error = (drawn.rgb - rgb).square().mean()
         terms = {
-            "photo": lambda: error,
             "point_color": lambda: losses.point_color(drawn.weights, drawn.colors, drawn.ray_ids, rgb),
             "background_entropy": lambda: losses.background_entropy(drawn.transmittance),
         }
         terms |= self.extra_terms(parts[0][0], batch, generator)
-        noted = {"samples": drawn.samples, "opacity": float(drawn.opacity.detach().mean())}
-        return Step(terms, error.detach(), noted, tensors=lambda: _named(drawn, "weights", "colors", "rgb"))
+        tensors = {"weights": drawn.weights, "colors": drawn.colors, "rgb": drawn.rgb}
+        return self.compared(drawn, rgb, terms, tensors, samples=drawn.samples)
 
     def advance(self, progress: float, step: int, optimizer: torch.optim.Optimizer) -> dict[str, float]:
         """See ``Method``; grow, after which optimiser and learning rates start anew; look for matter."""
