@@ -17,7 +17,7 @@ import torch
 from forewarp import load
 from forewarp.evaluation.images import moving_share
 from forewarp.evaluation.layers import moving_rows
-from forewarp.methods.particles.queries import MOVES
+from forewarp.methods.particles.model import MOVES
 from forewarp.runs.fitted import Fitted
 from forewarp.scene.camera import Camera
 from forewarp.scene.frame import Frame, spread
