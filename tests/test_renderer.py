@@ -1,5 +1,6 @@
 import importlib.util
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -108,7 +109,7 @@ def test_gradcheck():
     view = rays([[0.4, 1.2, -2.0], [0.5, -1.0, 3.1]], [[0.1, 0.2, 1], [0.1, 1, 0.3]])
 
     def run(values):
-        drawn = Renderer(color_threshold=0.0)(field.with_values(values), view, WHITE)
+        drawn = Renderer(color_threshold=0.0)(replace(field, values=values), view, WHITE)
         return drawn.rgb, drawn.depth, drawn.opacity
 
     assert torch.autograd.gradcheck(run, values)

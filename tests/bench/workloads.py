@@ -7,7 +7,7 @@ import statistics
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import torch
@@ -269,7 +269,7 @@ def fields_work(side: float, dense: bool) -> Work:
 def inpaint_work(side: float, dense: bool) -> Work:
     """Run the U-Net and the up-layer on the ball's box, or on the whole lattice, without the warp."""
     method = make_method(int(side), dense, effects=("view_dependence", "upsampler", "inpainter"))
-    warped = method.radiance().with_values(method.radiance().values.detach())
+    warped = replace(method.radiance(), values=method.radiance().values.detach())
     parts = method.inpainter, method.upsampler
     return backwards(dense, lambda: inpaint(warped, None, *parts)[1].values.square().mean())
 
@@ -279,8 +279,10 @@ def render_work(rays: float, dense: bool, step: float = 0.5) -> Work:
     method = make_method(128, dense, effects=("view_dependence",))
     grid, view = method.radiance(), some_pixels(int(rays)).rays()
     values = grid.values.detach().requires_grad_()
-    draw, shaded = Renderer(step=step, color_threshold=0.0 if dense else 1e-4), method.view_dependence
-    return backwards(dense, lambda: draw(grid.with_values(values), view, WHITE, shaded).rgb.square().mean())
+    draw, shade = Renderer(step=step, color_threshold=0.0 if dense else 1e-4), method.view_dependence
+    return backwards(
+        dense, lambda: draw(replace(grid, values=values), view, WHITE, shade).rgb.square().mean()
+    )
 
 
 def step_work(side: float, dense: bool, rays: int = 2048) -> Work:
@@ -370,9 +372,9 @@ def method_with(choices: Mapping, side: int) -> ForwardWarp:
     model = forward_model(**{"motion": None, "view_dependence": None} | choices)
     method = built(model, lattice, active, density_scale=2 / (side - 1), frames=50, box=lattice.box)
     with torch.no_grad():
-        method.radiance.parameter("density").fill_(6.0)
+        method.radiance.density.fill_(6.0)
         if method.background is not None:
-            method.background.parameter("density").fill_(-8.0)
+            method.background.density.fill_(-8.0)
     return method
 
 

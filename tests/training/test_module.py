@@ -34,8 +34,8 @@ class CountingRenderer(Renderer):
 def module(model=None, weights=None, renderer=None, **changes):
     torch.manual_seed(0)
     method = tiny.built(model or tiny.forward_model(), Lattice(tiny.BOX, (9, 7, 6)), density_scale=0.2)
-    for name in method.radiance.names:
-        torch.nn.init.normal_(method.radiance.parameter(name))
+    for parameter in method.radiance.rows():
+        torch.nn.init.normal_(parameter)
     method.renderer = renderer or method.renderer
     made = tiny.stage(weights=weights, **changes)
     curriculum = Curriculum([f.time for f in DATA.scene.train], 0.0)

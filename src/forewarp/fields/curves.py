@@ -34,26 +34,18 @@ class Curve:
         canonical_time: in [0, 1].
         straight: whether a spline ends without acceleration: what the first and the last picture leave open
             is then told by those beside them.
+        exactly: take ``count`` as it is, as a file says.
     """
 
     def __init__(
-        self, kind: str, count: int, times: int, canonical_time: float, *, straight: bool = False
+        self, kind: str, count: int, times: int, canonical_time: float, *, straight=False, exactly=False
     ) -> None:
-        self.kind, self.times, self.canonical_time = kind, times, canonical_time
+        self.kind, self.count, self.times, self.canonical_time = kind, count, times, canonical_time
         self.straight = straight and kind == "spline"
-        if kind == "cosines":
+        if kind == "cosines" and not exactly:
             self.count = max(1, min(count, times - 1))
-        else:
+        elif not exactly:
             self.count = max(min(times, 4), count - 2) if straight else max(4, count)
-
-    @classmethod
-    def exactly(
-        cls, kind: str, count: int, times: int, canonical_time: float, *, straight: bool = False
-    ) -> Curve:
-        """Make a curve of ``count`` coefficients, as a file says."""
-        curve = cls(kind, count, times, canonical_time, straight=straight)
-        curve.count = count
-        return curve
 
     @property
     def pieces(self) -> int:
@@ -137,7 +129,8 @@ class TrajectoryField(nn.Module):
         inputs = 3 * (1 + 2 * frequencies) + features
         self.network = mlp(inputs, 3 * self.bases, width=width, layers=layers, zero_last=True, leaky=True)
         self.register_buffer("bases_in_play", torch.tensor(self.bases))
-        self._nodes: tuple[Tensor, tuple[Tensor, Tensor, Tensor]] | None = None
+        # Of the grid that was asked for last: its voxels, their places, and the nodes around them.
+        self._nodes: tuple[Tensor, Tensor, tuple[Tensor, Tensor, Tensor]] | None = None
 
     def play(self, bases: float | None) -> int:
         """Use the first ``bases`` bases, all for None; return their number."""
@@ -150,9 +143,7 @@ class TrajectoryField(nn.Module):
         coordinates = self.lattice.to_lattice(points)
         inputs = positional_encoding(self.lattice.normalised(coordinates), self.frequencies)
         if self.features is not None:
-            grid, coordinates = self.features.parameter("grid"), self.features.lattice.to_lattice(points)
-            read = trilinear(grid, self.features.index, coordinates, grid.new_zeros(grid.shape[1]))
-            inputs = torch.cat([inputs, read], -1)
+            inputs = torch.cat([inputs, self.features.read("grid", points)], -1)
         return self.scale * self.network(inputs).reshape(-1, 3, self.bases)
 
     def basis(self, time: float | Tensor) -> Tensor:
@@ -166,17 +157,14 @@ class TrajectoryField(nn.Module):
 
         Cost: F2 on the nodes around the active voxels, then one trilinear read per voxel.
         """
-        points, (nodes, index, coordinates) = self._around(grid)
+        if self._nodes is None or self._nodes[0] is not grid.voxels:
+            points = grid.lattice.to_world(grid.voxels)
+            self._nodes = grid.voxels, points, self._nodes_around(points)
+        _, points, (nodes, index, coordinates) = self._nodes
         at_nodes = _matmul(self.coefficients(nodes if self.at_nodes else points), self.basis(time))
         if not self.at_nodes:
             return at_nodes
         return trilinear(at_nodes, index, coordinates, at_nodes.new_zeros(3))
-
-    def _around(self, grid: VoxelGrid):
-        if self._nodes is None or self._nodes[0] is not grid.voxels:
-            points = grid.lattice.to_world(grid.voxels)
-            self._nodes = (grid.voxels, (points, self._nodes_around(points)))
-        return self._nodes[1]
 
     def _nodes_around(self, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         coordinates = self.lattice.to_lattice(points)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Protocol
 
@@ -143,10 +143,6 @@ class RadianceGrid:
         """Colour (P, 3) at lattice coordinates (P, 3) seen along unit directions (P, 3)."""
         return shaded(self.features(points), directions, shade)
 
-    def with_values(self, values: Tensor) -> RadianceGrid:
-        """Return the same voxels with other values."""
-        return replace(self, values=values)
-
 
 class VoxelGrid(nn.Module):
     """Parameters (N, C) with one row per active voxel, and buffers with the voxels' positions.
@@ -178,9 +174,10 @@ class VoxelGrid(nn.Module):
         """Describe shape, share of active voxels and parameters."""
         return f"{self.lattice.shape}, active={len(self.voxels) / self.lattice.count:.1%}, {self.names}"
 
-    def parameter(self, name: str) -> nn.Parameter:
-        """Return a parameter (N, C) by name."""
-        return getattr(self, name)
+    def read(self, name: str, points: Tensor) -> Tensor:
+        """Interpolate a parameter (N, C) at world points (P, 3): (P, C); absent voxels count as 0."""
+        values, at = getattr(self, name), self.lattice.to_lattice(points)
+        return trilinear(values, self.index, at, values.new_zeros(values.shape[1]))
 
     def rows(self) -> list[nn.Parameter]:
         """Return the parameters (N, C), a row for each active voxel, in the order of ``names``."""
@@ -199,7 +196,7 @@ class VoxelGrid(nn.Module):
         rows = self.index[voxels[:, 0], voxels[:, 1], voxels[:, 2]].long()
         new = (rows < 0).nonzero()[:, 0]
         for name in self.names:
-            old = self.parameter(name)
+            old = getattr(self, name)
             values = old.data[rows.clamp(min=0)] if len(old) else old.data.new_zeros(len(rows), old.shape[1])
             if name in births:
                 values[new] = births[name]
@@ -221,7 +218,7 @@ class VoxelGrid(nn.Module):
         ones = torch.ones(len(self.voxels), 1, device=points.device)
         share = trilinear(ones, self.index, points, ones.new_zeros(1)).clamp(min=1e-6)
         for name in self.names:
-            p = self.parameter(name)
+            p = getattr(self, name)
             fill = p.data.new_full((p.shape[1],), empty.get(name, 0.0))
             values = trilinear(p.data, self.index, points, fill)
             setattr(self, name, nn.Parameter(values if name in empty else values / share))
@@ -328,13 +325,8 @@ class CanonicalRadiance(VoxelGrid):
         raise NotImplementedError
 
     def births(self, alpha: float) -> dict[str, float]:
-        """Return the values of new voxels of an opacity by parameter; others get their neighbours' mean."""
-        density = {"density": self.activation.raw(alpha, self.lattice.voxel_size)}
-        return density if "density" in self.names else {}
-
-    def empties(self) -> dict[str, float]:
-        """Return the values of absent voxels by parameter, for resampling; others do not count them."""
-        return {"density": EMPTY} if "density" in self.names else {}
+        """Return the raw density of new voxels of an opacity; other parameters get their neighbours' mean."""
+        return {"density": self.activation.raw(alpha, self.lattice.voxel_size)}
 
 
 class DirectRadiance(CanonicalRadiance):
@@ -431,7 +423,7 @@ def read_strided(grid: VoxelGrid, points: Tensor, strides: Sequence[int], *, pad
 
     Cost: as of S trilinear reads.
     """
-    values, (index, strided) = grid.parameter(grid.names[0]), _indices(grid, tuple(strides), padded)
+    values, (index, strided) = grid.rows()[0], _indices(grid, tuple(strides), padded)
     lattice = grid.lattice
     at, last = lattice.to_lattice(points), points.new_tensor(lattice.shape) - 1
     inside = lattice.holds(at)[..., None]

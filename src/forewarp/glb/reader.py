@@ -396,7 +396,7 @@ def _motion(container: Container, motion: Fields, canonical_time: float, count: 
     links, weights = _links(container, motion, moving, len(positions))
     padded = torch.zeros(2, count, links.shape[1])
     padded[0, :moving], padded[1, :moving] = links, weights
-    curve = Curve.exactly(kind, number, frames, canonical_time, straight=natural)
+    curve = Curve(kind, number, frames, canonical_time, straight=natural, exactly=True)
     times, offsets = _offsets(container, motion)
     if kind == "cosines" and times:
         raise ValueError(f"{about.place}.kind: expected spline, as there are timeOffsets, but got 'cosines'")

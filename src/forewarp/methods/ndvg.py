@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from forewarp import losses
-from forewarp.fields.grids import VoxelGrid, density_shift
+from forewarp.fields.grids import density_shift
 from forewarp.fields.networks import mlp
 from forewarp.fields.occupancy import Occupancy
 from forewarp.methods.method import Start, check_least, check_number, those_that_hold
@@ -143,13 +143,13 @@ class NDVG(MarchedMethod):
     def _go_on(self, before: NDVG) -> None:
         """Take over the deformation of the stage before, and do not look where it found nothing."""
         nodes = self.deformation.lattice.to_world(self.deformation.voxels)
-        self.deformation.features.copy_(_read(before.deformation, "features", nodes))
+        self.deformation.features.copy_(before.deformation.read("features", nodes))
         self.network.load_state_dict(before.network.state_dict())
         if self.occupancy is not None:
             self.occupancy.settle(before.density_found, _some(self.times))
         voxels = self.canonical.lattice.to_world(self.canonical.voxels)
         if self.stage.carry:
-            sigma = before.activation.sigma(_read(before.canonical, "density", voxels))
+            sigma = before.activation.sigma(before.canonical.read("density", voxels))
             raised = torch.expm1((sigma * self.activation.density_scale).double()).clamp(min=_LEAST)
             self.canonical.density.copy_(torch.log(raised) - self.shift)
         if self.stage.masked:
@@ -171,7 +171,7 @@ class NDVG(MarchedMethod):
 
     def carried(self, points: Tensor, time: float) -> tuple[Tensor, Tensor]:
         """World points (P, 3) -> what ``F`` says of them at a time: offset (P, 3), raw mask (P,)."""
-        inputs = _read(self.deformation, "features", points), points, points.new_tensor([[time]])
+        inputs = self.deformation.read("features", points), points, points.new_tensor([[time]])
         encoded = [positional_encoding(x, self.octaves[0]).expand(len(points), -1) for x in inputs]
         found = self.network(torch.cat(encoded, -1))
         return found[:, :3], found[:, 3]
@@ -272,23 +272,17 @@ class NDVGField:
         at = canonical.lattice.to_lattice(placed.detach())
         inside = canonical.lattice.holds(at)
         step = method.marching.step * method.lattice_marched.voxel_size
-        alpha = inside * mask * method.activation.alpha(_read(canonical, "density", placed)[:, 0], step)
+        alpha = inside * mask * method.activation.alpha(canonical.read("density", placed)[:, 0], step)
 
         def color(rows: Tensor | slice, directions: Tensor) -> Tensor:
             there = placed[rows]
-            features = _read(canonical, "color", there)
+            features = canonical.read("color", there)
             if method.color is not None:
                 place, direction = map(positional_encoding, (there, directions), method.octaves)
                 features = method.color(torch.cat([features, place, direction], -1))
             return mask[rows, None] * torch.sigmoid(features)
 
         return -torch.log1p(-alpha.clamp(max=_OPAQUE)) / step, color
-
-
-def _read(grid: VoxelGrid, name: str, points: Tensor) -> Tensor:
-    """Read a parameter (N, C) of a dense grid at world points (P, 3): (P, C)."""
-    values = grid.parameter(name)
-    return trilinear(values, grid.index, grid.lattice.to_lattice(points), values.new_zeros(values.shape[1]))
 
 
 def _is_pair(given: object) -> bool:

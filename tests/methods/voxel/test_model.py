@@ -262,7 +262,7 @@ def test_every_term_is_the_pure_function_of_its_parts():
         both,
         flow=lambda grid: grid.values[:, :3].sin(),
         inpaint_difference=lambda grid: grid.values.cos(),
-        background=lambda grid: grid.with_values(grid.values + 1),
+        background=lambda grid: replace(grid, values=grid.values + 1),
     )
     grid, flow = state.canonical, state.flow / 0.5
     pairs = neighbour_pairs(grid.index)

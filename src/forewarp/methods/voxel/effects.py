@@ -334,7 +334,7 @@ def inpaint(
     dense = inputs = densify(warped, crop)
     if inpainter.coverage_channel:
         cover = warped.values.new_ones(len(warped.values)) if coverage is None else coverage.clamp(max=1)
-        cover = densify(warped.with_values(cover[:, None]), crop).clamp(min=0)
+        cover = densify(replace(warped, values=cover[:, None]), crop).clamp(min=0)
         inputs = torch.cat([dense, cover], 1)
     features = inpainter.features(inputs)
     learned = isinstance(upsampler, LearnedUpsampler)

@@ -130,7 +130,7 @@ def first_voxels(start: Start, stage: VoxelStage, lattice: Lattice) -> Tensor:
 def seen_rows(radiance: VoxelGrid, optimizer: Optimizer) -> Tensor:
     """Voxels (N,) bool that some view has seen: their colour has had a gradient since the moments began."""
     name = "color" if "color" in radiance.names else radiance.names[0]
-    moments = optimizer.state.get(radiance.parameter(name), {}).get("exp_avg_sq")
+    moments = optimizer.state.get(getattr(radiance, name), {}).get("exp_avg_sq")
     if moments is None:
         return torch.ones_like(radiance.voxels[:, 0], dtype=torch.bool)
     return moments.amax(-1) > 0
@@ -187,6 +187,6 @@ def resample(
     if not bool(mask.any()):
         mask = torch.ones_like(mask)
     before = grid.rows()
-    grid.resample(lattice, mask, grid.empties())
+    grid.resample(lattice, mask, {"density": EMPTY})
     if optimizer is not None:
         renew_parameters(optimizer, before, grid.rows(), None)
