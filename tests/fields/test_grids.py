@@ -213,14 +213,12 @@ def test_strided_reads_equal_reads_of_coarser_grids():
         torch.testing.assert_close(read, expected, atol=1e-5, rtol=1e-5)
 
 
-def test_a_new_lattice_is_noticed_and_other_sizes_are_refused_or_padded():
+def test_a_new_lattice_is_noticed_and_other_sizes_are_padded():
     grid, points = strided_grid(5, 5, 5)
     assert grids.read_strided(grid, points, (1, 2, 4)).shape == (50, 6)
     lattice = Lattice(grid.lattice.box, (6, 5, 5))
     grid.resample(lattice, torch.ones(6, 5, 5, dtype=torch.bool), {"features": 0.0})
-    with pytest.raises(ValueError, match=r"expected sizes of 4 k \+ 1, but got \(6, 5, 5\)"):
-        grids.read_strided(grid, points, (1, 2, 4))
-    assert grids.read_strided(grid, points, (1, 2, 4), padded=True).isfinite().all()
+    assert grids.read_strided(grid, points, (1, 2, 4)).isfinite().all()
 
 
 def test_strided_reads_are_0_outside_and_differentiable_inside():

@@ -403,27 +403,23 @@ class FeatureRadiance(CanonicalRadiance):
         self.network[-1].bias[0] = self.activation.raw(alpha, self.lattice.voxel_size)
 
 
-def read_strided(grid: VoxelGrid, points: Tensor, strides: Sequence[int], *, padded: bool = False) -> Tensor:
+def read_strided(grid: VoxelGrid, points: Tensor, strides: Sequence[int]) -> Tensor:
     """Interpolate trilinearly between every s-th voxel, for each stride s.
 
     Args:
-        grid: with one parameter (N, C).
+        grid: with one parameter (N, C). Along an axis of n voxels, where n - 1 is not a multiple of the last
+            stride, zeros are added behind the last voxel until that is so, and stretch all over the box:
+            voxels are then not where the lattice has them.
         points: (P, 3), world units.
-        strides: ascending, the last a multiple of the others. Along each axis a lattice of n voxels needs
-            n - 1 to be a multiple of the last.
-        padded: add zeros behind the last voxel until that is so, and stretch all over the box: voxels are
-            then not where the lattice has them.
+        strides: ascending, the last a multiple of the others.
 
     Returns:
         (P, C S), the channels of the first stride first; 0 outside the box. Differentiable in the grid's
         values and in the points.
 
-    Raises:
-        ValueError: for a lattice of other sizes, unless ``padded``.
-
     Cost: as of S trilinear reads.
     """
-    values, (index, strided) = grid.rows()[0], _indices(grid, tuple(strides), padded)
+    (values,), (index, strided) = grid.rows(), _indices(grid, tuple(strides))
     lattice = grid.lattice
     at, last = lattice.to_lattice(points), points.new_tensor(lattice.shape) - 1
     inside = lattice.holds(at)[..., None]
@@ -433,16 +429,12 @@ def read_strided(grid: VoxelGrid, points: Tensor, strides: Sequence[int], *, pad
     return torch.cat(read, -1) * inside
 
 
-def _indices(grid: VoxelGrid, strides: tuple[int, ...], padded: bool) -> tuple[Tensor, list[Tensor]]:
-    """Return the index, padded where asked for, and every s-th entry of it; kept until the grid changes."""
+def _indices(grid: VoxelGrid, strides: tuple[int, ...]) -> tuple[Tensor, list[Tensor]]:
+    """Return the padded index, and every s-th entry of it; kept until the grid changes."""
     known = getattr(grid, "_strided", None)
-    if known is None or known[0] is not grid.index or known[1] != (strides, padded):
-        missing = [(1 - n) % strides[-1] for n in grid.index.shape]
-        if any(missing) and not padded:
-            got = tuple(grid.index.shape)
-            raise ValueError(f"a strided grid: expected sizes of {strides[-1]} k + 1, but got {got}")
-        ends = [end for more in reversed(missing) for end in (0, more)]
+    if known is None or known[0] is not grid.index or known[1] != strides:
+        ends = [end for n in reversed(grid.index.shape) for end in (0, (1 - n) % strides[-1])]
         index = torch.nn.functional.pad(grid.index, ends, value=-1)
-        known = grid.index, (strides, padded), (index, [index[::s, ::s, ::s].contiguous() for s in strides])
+        known = grid.index, strides, (index, [index[::s, ::s, ::s].contiguous() for s in strides])
         grid._strided = known
     return known[2]

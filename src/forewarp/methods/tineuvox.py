@@ -102,7 +102,7 @@ class TiNeuVox(MarchedMethod):
 
     def read(self, points: Tensor) -> Tensor:
         """World points (P, 3) -> features (P, 3 C) at the three strides; 0 outside the box."""
-        return read_strided(self.grid, points, _STRIDES, padded=self.padded)
+        return read_strided(self.grid, points, _STRIDES)
 
     def code(self, network: nn.Module, number: float) -> Tensor:
         """A time, or a camera's number -> code (5 C,)."""
