@@ -130,5 +130,5 @@ def test_a_step_that_cannot_be_stored_hides_nothing(tmp_path):
 def test_a_gradient_whose_square_overflows_is_bad():
     large = [("a", torch.ones(3)), ("b", torch.tensor([1e20]))]
     assert (first_bad(large), first_bad(large, squared=True)) == (None, "b")
-    with pytest.raises(ValueError, match="sentinel.skip: expected a whole number of steps >= 0, but got -1"):
+    with pytest.raises(ValueError, match="sentinel.skip: expected a whole number >= 0, but got -1"):
         Sentinel(".", skip=-1)

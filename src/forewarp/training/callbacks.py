@@ -11,6 +11,7 @@ from collections import defaultdict
 
 import lightning
 
+from forewarp.methods.method import check_least
 from forewarp.progress import ProgressLine, time_text
 
 _SMOOTHING = 0.02  # weight of the newest step in the PSNR shown: a mean over about 50 steps
@@ -93,8 +94,7 @@ class Scalars(lightning.Callback):
     """
 
     def __init__(self, *, every: int = 20) -> None:
-        if every < 1:
-            raise ValueError(f"callbacks.scalars.every: expected at least 1 step, but got {every}")
+        check_least(1, of="callbacks.scalars", every=every)
         self.every = every
         self._values: dict[str, list[float]] = defaultdict(list)
 

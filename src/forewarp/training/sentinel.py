@@ -11,6 +11,7 @@ import lightning
 import torch
 from torch import Tensor
 
+from forewarp.methods.method import check_least
 from forewarp.scene.view import Batch
 from forewarp.training.checkpoints import write_archive
 from forewarp.training.module import DynamicSceneModule
@@ -94,8 +95,7 @@ class Sentinel(lightning.Callback):
     """
 
     def __init__(self, folder: Path, *, skip: int = 0, every: int = 10) -> None:
-        if type(skip) is not int or skip < 0:
-            raise ValueError(f"sentinel.skip: expected a whole number of steps >= 0, but got {skip}")
+        check_least(of="sentinel", skip=skip)
         self.folder, self.skip, self.every, self.skipped = Path(folder), skip, every, 0
 
     def on_train_batch_start(self, trainer, module, batch, batch_idx) -> None:
