@@ -262,7 +262,7 @@ def fields_work(side: float, dense: bool) -> Work:
     """Evaluate F1 and F2 and the cosines at a time."""
     method = make_method(int(side), dense, effects=("motion", "view_dependence"))
 
-    radiance, flow = method.radiance, method.motion.flow
+    radiance, flow = method.radiance, method.motion.trajectory.flow
     return backwards(dense, lambda: radiance().values.sum() + flow(radiance, TIME).sum())
 
 

@@ -84,7 +84,7 @@ def calls(of, *names):
 
 
 SHADING = calls(SphericalHarmonics, "forward") + calls(ViewNetwork, "forward")
-SPLAT = calls(Motion, "flow", "warp") + calls(TrajectoryField, "coefficients")
+SPLAT = calls(Motion, "warp") + calls(TrajectoryField, "flow", "coefficients")
 FINER = calls(LearnedUpsampler, "residual", "forward") + calls(TrilinearUpsampler, "forward")
 STILL = calls(StaticBackground, "forward") + calls(Together, "density")
 VIEW = Effect({"view_dependence": SphericalHarmonics}, SHADING)

@@ -10,7 +10,6 @@ from torch import Tensor, nn
 
 from forewarp.fields.grids import VoxelGrid
 from forewarp.fields.networks import mlp
-from forewarp.ops.backend import check_value
 from forewarp.ops.curves import dct_basis, spline_basis, spline_shares
 from forewarp.ops.encode import positional_encoding
 from forewarp.ops.grid import corner_weights, index_of, trilinear
@@ -84,7 +83,7 @@ class TrajectoryField(nn.Module):
     Args:
         box: normalises positions to [-1, 1]; the same in all stages, so that the network carries over.
         bases: K, reduced to ``frames - 1`` if larger.
-        frames: T, the number of distinct training times.
+        frames: T, the number of distinct training times, at least 2.
         canonical_time: time at which flow is exactly 0.
         nodes: number of nodes along the box's mean side, at least 8; 0: no nodes.
         features: channels of the deformation feature grid, at the nodes or, without nodes, at ``voxels``; 0:
@@ -92,9 +91,6 @@ class TrajectoryField(nn.Module):
         voxels: lattice of the canonical voxels; None: that of the nodes.
         width, layers, frequencies: size of F2, octaves of the positional encoding.
         padding: lets objects move at the first and last frame (see ``dct_basis``).
-
-    Raises:
-        ValueError: with a single training time.
     """
 
     def __init__(
@@ -113,8 +109,6 @@ class TrajectoryField(nn.Module):
         padding: float = 0.0,
     ) -> None:
         super().__init__()
-        wanted = "at least 2 distinct training times"
-        check_value("model.motion", frames, wanted, lambda count: count >= 2, "choose model/motion=none")
         self.box, self.frames, self.canonical_time = box, frames, canonical_time
         self.bases = min(bases, frames - 1)
         self.scale = 0.5 * max(box.size)

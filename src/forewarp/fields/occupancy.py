@@ -101,8 +101,7 @@ class Occupancy(nn.Module):
         if not len(rows):
             return None
         low, high = rows.amin(0) - 1, rows.amax(0) + 2
-        corners = (self.low + corner.clamp(0, self.side) * self.cell for corner in (low, high))
-        return Box(*(tuple(corner.tolist()) for corner in corners))
+        return Box(*(self.low + corner.clamp(0, self.side) * self.cell for corner in (low, high)))
 
     @property
     def cells(self) -> Tensor:

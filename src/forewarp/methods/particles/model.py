@@ -504,7 +504,7 @@ class Particles(Method):
             points = moved(self.means.data, self.warp(time))[0][solid]
             low, high = torch.minimum(low, points.amin(0)), torch.maximum(high, points.amax(0))
         pad = 2 * float(self.scales[solid].exp().median()) + 1e-3 * float(self.extent)
-        return Box(tuple((low - pad).tolist()), tuple((high + pad).tolist()))
+        return Box(low - pad, high + pad)
 
     def matter(self) -> Cloud:
         """See ``HasMatter``."""

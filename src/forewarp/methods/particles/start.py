@@ -107,7 +107,7 @@ def hull_surface(scene: Scene, frames: list[int], count: int) -> Cloud | None:
         return None
     pad = max(rough.spacing)
     low, high = points[inside].amin(0) - pad, points[inside].amax(0) + pad
-    box = Box(tuple(low.tolist()), tuple(high.tolist())).intersection(scene.box.padded(pad))
+    box = Box(low, high).intersection(scene.box.padded(pad))
     fine = Lattice.of_count(box, min(_FINE, 2 * side) ** 3)
     voxels = fine.all_voxels()
     # Only what the rough hull, a voxel wider, allows is looked at again.

@@ -146,10 +146,6 @@ class BackwardWarp(VoxelMethod):
             paths.append(at)
         return torch.stack(paths, 1)
 
-    def moved(self, points: Tensor, rows: Tensor, time: float) -> Tensor:
-        """Move the canonical voxels ``rows`` (N,) bool, at ``points`` (M, 3), to ``time`` (M, 3)."""
-        return self.trajectories(points, torch.tensor([time]))[:, 0]
-
     def displacement(self, points: Tensor, time: float) -> Tensor:
         """Return the displacement (N, 3) of points at ``time`` to the canonical time; differentiable."""
         return self.deformation(points, time)

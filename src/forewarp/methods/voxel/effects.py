@@ -12,7 +12,7 @@ from torch.nn import functional
 from torch.utils.checkpoint import checkpoint
 
 from forewarp.fields.curves import TrajectoryField
-from forewarp.fields.grids import EMPTY, DirectRadiance, FieldAtTime, RadianceGrid, Shade, VoxelGrid
+from forewarp.fields.grids import EMPTY, DirectRadiance, FieldAtTime, RadianceGrid, Shade
 from forewarp.fields.networks import mlp
 from forewarp.methods.method import FRACTION, check_least, check_number
 from forewarp.ops.backend import check_value
@@ -42,10 +42,6 @@ class Motion(nn.Module):
         check_number("model.motion.fade", fade, *FRACTION)
         check_number("model.motion.rest", rest, "a number in [0, 0.5)", lambda voxels: 0 <= voxels < 0.5)
         self.trajectory, self.tau, self.fade, self.rest = trajectory, tau, fade, rest
-
-    def flow(self, grid: VoxelGrid, time: float) -> Tensor:
-        """Return the flow (N, 3) of a grid's active voxels from the canonical time, in world units."""
-        return self.trajectory.flow(grid, time)
 
     def warp(self, canonical: RadianceGrid, voxels: Tensor, flow: Tensor) -> tuple[RadianceGrid, Tensor, int]:
         """Average-splat ``canonical`` along a flow.

@@ -77,14 +77,15 @@ class ForwardWarp(VoxelMethod):
         canonical = self.radiance()  # V_R = F1
         warped, flow, coverage, dropped = canonical, None, None, 0  # V_R^t
         if self.motion is not None and moment.time != self.canonical_time:
-            flow = self.motion.flow(self.radiance, moment.time)  # V_flow
+            flow = self.motion.trajectory.flow(self.radiance, moment.time)  # V_flow
             warped, coverage, dropped = self.motion.warp(canonical, self.radiance.voxels, flow)
+        first = "warped" if self.upsampler is None else "upsampled"
         if self.inpainter is None:
             upsampled, difference = warped if self.upsampler is None else self.upsampler(warped), None
-            fields = {self.first_rendering: upsampled}  # V_RUp
+            fields = {first: upsampled}  # V_RUp
         else:
             upsampled, inpainted, difference = inpaint(warped, coverage, self.inpainter, self.upsampler)
-            fields = {self.first_rendering: upsampled, "inpainted": inpainted}  # V_RUp, V_RInp
+            fields = {first: upsampled, "inpainted": inpainted}  # V_RUp, V_RInp
         found = {"flow": flow, "coverage": coverage, "dropped": dropped, "inpaint_difference": difference}
         length = 2 / 3 * self.half_extent if self.moves else 1.0
         return self.snapshot(moment, fields, canonical, length=length, **found)
@@ -114,11 +115,6 @@ class ForwardWarp(VoxelMethod):
             }
         return those_that_hold(notes)
 
-    @property
-    def first_rendering(self) -> str:
-        """Name of the rendering without inpainting: ``upsampled``, or ``warped`` without an up-sampler."""
-        return "warped" if self.upsampler is None else "upsampled"
-
     def advance(self, progress: float, step: int, optimizer: torch.optim.Optimizer) -> dict[str, float]:
         """Follow the schedules of the lattices and of the trajectory bases."""
         noted = super().advance(progress, step, optimizer)
@@ -134,7 +130,7 @@ class ForwardWarp(VoxelMethod):
 
     def moved(self, points: Tensor, rows: Tensor, time: float) -> Tensor:
         """Move the canonical voxels ``rows`` (N,) bool, at ``points`` (M, 3), to ``time`` (M, 3)."""
-        return points + self.motion.flow(self.radiance, time)[rows]
+        return points + self.motion.trajectory.flow(self.radiance, time)[rows]
 
     def displacement(self, points: Tensor, time: float) -> Tensor:
         """Return the displacement (N, 3) of canonical points at ``time``, in world units; differentiable."""

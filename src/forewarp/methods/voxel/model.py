@@ -370,7 +370,7 @@ class VoxelMethod(Method):
 
     def moved(self, points: Tensor, rows: Tensor, time: float) -> Tensor:
         """Move the canonical voxels ``rows`` (N,) bool, at ``points`` (M, 3), to ``time`` (M, 3)."""
-        raise NotImplementedError
+        return self.trajectories(points, torch.tensor([time]))[:, 0]
 
     def displacement(self, points: Tensor, time: float) -> Tensor:
         """Return how far points (N, 3) are from the canonical time at ``time`` (N, 3); differentiable."""
@@ -393,7 +393,7 @@ class VoxelMethod(Method):
             points = self.moved(home, solid, time)
             low, high = torch.minimum(low, points.amin(0)), torch.maximum(high, points.amax(0))
         margin = _MARGIN * grid.lattice.voxel_size  # added first, as a flat object has no box of its own
-        return Box(tuple((low - margin).tolist()), tuple((high + margin).tolist()))
+        return Box(low - margin, high + margin)
 
     @torch.no_grad()
     def matter(self) -> Cloud:
