@@ -220,12 +220,9 @@ class NDVG(MarchedMethod):
             shape = self.deformation.lattice.shape
             return second_variation(self.deformation.features.reshape(*shape, -1))
 
-        def still() -> Tensor | None:
-            points = self.some_still(_STILL, generator)
-            return None if points is None else field.offset(points)[0].square().mean()
-
         terms = {"flow_l1": lambda: of_all(field.offsets), "tv_deformation": tv_deformation}
-        return terms | {"canonical": canonical, "still": still}
+        terms["still"] = lambda: self.stray(lambda points: field.offset(points)[0], _STILL, generator)
+        return terms | {"canonical": canonical}
 
     def param_groups(self) -> dict[str, list[nn.Parameter]]:
         """Group parameters: ``density``, ``color`` and ``deformation`` (the grids), ``network``."""

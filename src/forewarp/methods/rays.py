@@ -505,12 +505,16 @@ class MarchedMethod(RayMethod):
         """
         return {}
 
-    def some_still(self, count: int, generator: torch.Generator) -> Tensor | None:
-        """Draw at most so many points that never move (P, 3); None where none is known."""
+    def stray(
+        self, offset: Callable[[Tensor], Tensor], count: int, generator: torch.Generator
+    ) -> Tensor | None:
+        """Mean square of the ``offset`` (P, 3) of at most so many points (P, 3) that never move; None where
+        none is known.
+        """
         if self.still is None or not len(self.still):
             return None
         rows = torch.randint(len(self.still), (min(count, len(self.still)),), generator=generator)
-        return self.still[rows].to(self.device)
+        return offset(self.still[rows].to(self.device)).square().mean()
 
     def along(self, moment: Moment, rays: Rays, background: Tensor) -> Marched:
         """See ``RayMethod``; also return the samples."""

@@ -127,15 +127,12 @@ class TiNeuVox(MarchedMethod):
     def extra_terms(self, field: TiNeuVoxField, batch: Batch, generator: torch.Generator) -> Terms:
         """Offer ``still``, at points that never move, and ``tv_grid``, the grid's total variation."""
 
-        def still() -> Tensor | None:
-            points = self.some_still(max(1, len(batch) // _STILL_SHARE), generator)
-            return None if points is None else field.offset(points).square().mean()
-
         def tv_grid() -> Tensor:
             shape = self.grid.lattice.shape
             return huber_variation(self.grid.features.reshape(*shape, -1)) * (max(shape) / 128 / 6)
 
-        return {"still": still, "tv_grid": tv_grid}
+        count = max(1, len(batch) // _STILL_SHARE)
+        return {"still": lambda: self.stray(field.offset, count, generator), "tv_grid": tv_grid}
 
     def param_groups(self) -> dict[str, list[nn.Parameter]]:
         """Group parameters: ``grid``, ``deformation``, and ``network`` (all other networks)."""
