@@ -155,16 +155,13 @@ class VoxelMethod(Method):
             box, notes = start.handover.box, start.handover.notes
         lattice, active = _resampled(before and before.radiance, box, stage, "num_voxels")
         density_scale = notes.get("density_scale", lattice.voxel_size)
-        if before is not None:
-            density_scale = before.radiance.activation.density_scale
-        else:
+        if before is None:
             active = first_voxels(start, stage, lattice)
         view_dependence = self.used("view_dependence", view_dependence)
         shade = None if view_dependence is None else view_dependence()
-        features = 3 if shade is None else shade.features
-        self.channels = 1 + features  # of a radiance grid
+        self.channels = 1 + (3 if shade is None else shade.features)  # of a radiance grid
         common = {"density_scale": density_scale}
-        self.radiance = radiance(lattice, active, features=features, box=scene.box, **common)
+        self.radiance = radiance(lattice, active, features=self.channels - 1, box=scene.box, **common)
         self.view_dependence, self.background = shade, None
         # The grids that follow a schedule, by its key.
         self.grids: dict[str, CanonicalRadiance] = {"num_voxels": self.radiance}
