@@ -179,10 +179,9 @@ class Sentinel(lightning.Callback):
 
 def _plain(batch: Batch) -> list[dict]:
     """Return the observations of a batch as tensors and plain numbers."""
-    plain = []
-    for seen in (*batch.observations, *batch.instant):
-        moment, view = seen.moment, seen.view
-        about = {"time": moment.time, "frame": moment.frame, "camera": moment.camera}
-        about |= {"camera_to_world": view.camera.camera_to_world, "pixels": view.indices}
-        plain.append(about | {"rgb": seen.rgb.cpu(), "background": seen.background.cpu()})
-    return plain
+    return [
+        {"time": seen.moment.time, "frame": seen.moment.frame, "camera": seen.moment.camera}
+        | {"camera_to_world": seen.view.camera.camera_to_world, "pixels": seen.view.indices}
+        | {"rgb": seen.rgb.cpu(), "background": seen.background.cpu()}
+        for seen in (*batch.observations, *batch.instant)
+    ]
