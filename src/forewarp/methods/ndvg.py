@@ -16,7 +16,7 @@ from forewarp.fields.grids import density_shift
 from forewarp.fields.networks import mlp
 from forewarp.fields.occupancy import Occupancy
 from forewarp.methods.method import Start, check_least, check_number, those_that_hold
-from forewarp.methods.rays import JUMP, NO_JUMP, MarchedMethod, Marching, Terms, regrow, whole_grid
+from forewarp.methods.rays import JUMP, NO_JUMP, MarchedMethod, Marching, PointField, Terms, whole_grid
 from forewarp.ops.backend import check_value
 from forewarp.ops.encode import encoded_size, positional_encoding
 from forewarp.ops.grid import dilate, second_variation, trilinear
@@ -185,8 +185,8 @@ class NDVG(MarchedMethod):
 
     def grow(self, num_voxels: float, optimizer: torch.optim.Optimizer) -> None:
         """See ``MarchedMethod``; raw density falls by ``sink``."""
-        regrow(self.canonical, Lattice.of_count(self.box, num_voxels), optimizer)
-        regrow(self.deformation, self.marching_lattice(num_voxels), optimizer)
+        self.regrow(self.canonical, Lattice.of_count(self.box, num_voxels), optimizer)
+        self.regrow(self.deformation, self.marching_lattice(num_voxels), optimizer)
         self.canonical.density.data -= self.stage.sink
 
     @torch.no_grad()
@@ -244,11 +244,12 @@ class NDVG(MarchedMethod):
         return those_that_hold({JUMP: not self.continuous, unseen: self.never_seen > 0, free: loose})
 
 
-class NDVGField:
+class NDVGField(PointField):
     """NDVG at a time (see ``PointField``); keeps the ``points`` (P, 3) asked last, and their ``offsets``."""
 
     def __init__(self, method: NDVG, time: float) -> None:
-        self.method, self.time = method, time
+        super().__init__(method)
+        self.time = time
 
     def offset(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """World points (P, 3) -> offsets to their canonical places (P, 3), masks (P,) in (0, 1)."""
@@ -260,14 +261,13 @@ class NDVGField:
             offset = offset - method.carried(points, method.canonical_time)[0]
         return offset, torch.sigmoid(hidden)
 
-    def look_up(self, points: Tensor) -> tuple[Tensor, Callable[[Tensor | slice, Tensor], Tensor]]:
+    def at(self, points: Tensor) -> tuple[Tensor, Callable]:
         """See ``PointField``. The density is the one whose opacity over a step is the masked one."""
         method, canonical = self.method, self.method.canonical
         self.points = points
         self.offsets, mask = self.offset(points)
         placed = points + self.offsets
-        at = canonical.lattice.to_lattice(placed.detach())
-        inside = canonical.lattice.holds(at)
+        inside = canonical.lattice.holds(canonical.lattice.to_lattice(placed.detach()))
         step = method.marching.step * method.lattice_marched.voxel_size
         alpha = inside * mask * method.activation.alpha(canonical.read("density", placed)[:, 0], step)
 

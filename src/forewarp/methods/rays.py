@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Protocol
 
 import torch
 from torch import Tensor, nn
@@ -419,26 +418,27 @@ class Marching:
         check_least(of="model.marching", occupancy=self.occupancy, look_every=self.look_every)
 
 
-class PointField(Protocol):
-    """A method at one moment, asked at world points."""
+class PointField:
+    """A method at one moment. A subclass says what is ``at`` world points; the renderer asks for it in
+    coordinates of the ``lattice`` whose ``cells`` are marched: those that may hold matter.
+    """
 
-    def look_up(self, points: Tensor) -> tuple[Tensor, Callable[[Tensor | slice, Tensor], Tensor]]:
+    def __init__(self, method: MarchedMethod) -> None:
+        self.method = method
+        everywhere = torch.ones(1, 1, 1, dtype=torch.bool, device=method.device)
+        self.cells = everywhere if method.occupancy is None else method.occupancy.cells
+        self.lattice = Lattice(method.box, tuple(n + 1 for n in self.cells.shape))
+        self.voxel_size = method.lattice_marched.voxel_size
+
+    def at(self, points: Tensor) -> tuple[Tensor, Callable]:
         """World points (P, 3) -> density (P,) per world unit, and a function: rows (K,) of these points and
         unit directions (K, 3) -> colour (K, 3).
         """
+        raise NotImplementedError
 
-
-@dataclass(frozen=True)
-class _Placed:
-    """A ``PointField`` as the renderer asks it: in coordinates of the ``lattice`` whose cells are marched."""
-
-    field: PointField
-    lattice: Lattice
-    cells: Tensor
-    voxel_size: float
-
-    def look_up(self, points: Tensor) -> tuple[Tensor, Callable[[Tensor | slice, Tensor], Tensor]]:
-        return self.field.look_up(self.lattice.to_world(points))
+    def look_up(self, points: Tensor) -> tuple[Tensor, Callable]:
+        """See ``at``, for points in lattice coordinates."""
+        return self.at(self.lattice.to_world(points))
 
 
 class MarchedMethod(RayMethod):
@@ -498,6 +498,13 @@ class MarchedMethod(RayMethod):
         """Resample the lattices to about ``num_voxels`` voxels."""
         raise NotImplementedError
 
+    @staticmethod
+    def regrow(grid: VoxelGrid, lattice: Lattice, optimizer: torch.optim.Optimizer) -> None:
+        """Interpolate a grid of all voxels to another lattice; its moments start at 0."""
+        before = grid.rows()
+        grid.resample(lattice, torch.ones(lattice.shape, dtype=torch.bool), dict.fromkeys(grid.names, 0.0))
+        renew_parameters(optimizer, before, grid.rows(), None)
+
     def extra_terms(self, field: PointField, batch: Batch, generator: torch.Generator) -> Terms:
         """Return the loss terms beside those of the rays.
 
@@ -518,22 +525,12 @@ class MarchedMethod(RayMethod):
 
     def along(self, moment: Moment, rays: Rays, background: Tensor) -> Marched:
         """See ``RayMethod``; also return the samples."""
-        return self.marched(self.field(moment), rays, background)
+        return self.renderer(self.field(moment), rays, background)
 
     def image(self, moment: Moment, rays: Rays, background: Tensor) -> Rendering:
         """See ``RayMethod``."""
         field, behind = self.field(moment), background.expand(len(rays), 3)
-        return in_chunks(lambda some: self.marched(field, rays[some], behind[some]), len(rays), _RAYS)
-
-    def marched(
-        self, field: PointField, rays: Rays, background: Tensor, generator: torch.Generator | None = None
-    ) -> Marched:
-        """March rays through the occupied cells of a field; ``generator`` jitters the samples."""
-        everywhere = torch.ones(1, 1, 1, dtype=torch.bool, device=self.device)
-        cells = everywhere if self.occupancy is None else self.occupancy.cells
-        lattice = Lattice(self.box, tuple(n + 1 for n in cells.shape))
-        placed = _Placed(field, lattice, cells, self.lattice_marched.voxel_size)
-        return self.renderer(placed, rays, background, generator=generator)
+        return in_chunks(lambda some: self.renderer(field, rays[some], behind[some]), len(rays), _RAYS)
 
     def look(self, batch: Batch, factors: Mapping[str, float], generator: torch.Generator) -> Step:
         """See ``Method.look``; a batch holds one time, as no neighbours are asked for, seen by one or
@@ -544,7 +541,7 @@ class MarchedMethod(RayMethod):
         """
         rgb, jitter = batch.joined()[1], generator if self.marching.jitter else None
         parts = [(self.field(moment), *part) for moment, *part in self.parts_of(batch)]
-        drawn = Marched.joined([self.marched(*part, jitter) for part in parts])
+        drawn = Marched.joined([self.renderer(*part, generator=jitter) for part in parts])
         self.dead_start.look(len(drawn.weights) > 0)
         terms = {
             "point_color": lambda: losses.point_color(drawn.weights, drawn.colors, drawn.ray_ids, rgb),
@@ -574,7 +571,7 @@ class MarchedMethod(RayMethod):
 
     def density_at(self, points: Tensor, time: float) -> Tensor:
         """World points (P, 3) and a time -> density (P,), per world unit."""
-        return self.field(Moment(time)).look_up(points)[0]
+        return self.field(Moment(time)).at(points)[0]
 
     def optimizer(self, groups: list[dict]) -> torch.optim.Optimizer:
         """Make Adam with the published betas; voxels that no sample touched keep their moments."""
@@ -601,10 +598,3 @@ class MarchedMethod(RayMethod):
 def whole_grid(lattice: Lattice, channels: dict[str, int]) -> VoxelGrid:
     """Make a grid of zeros of all voxels of a lattice."""
     return VoxelGrid(lattice, torch.ones(lattice.shape, dtype=torch.bool), channels)
-
-
-def regrow(grid: VoxelGrid, lattice: Lattice, optimizer: torch.optim.Optimizer) -> None:
-    """Interpolate such a grid to another lattice; its moments start at 0."""
-    before = grid.rows()
-    grid.resample(lattice, torch.ones(lattice.shape, dtype=torch.bool), dict.fromkeys(grid.names, 0.0))
-    renew_parameters(optimizer, before, grid.rows(), None)

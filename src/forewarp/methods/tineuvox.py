@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from forewarp.fields.grids import density_shift, read_strided
 from forewarp.fields.networks import Template, mlp
 from forewarp.methods.method import FRACTION, Start, check_least, check_number, those_that_hold
-from forewarp.methods.rays import MarchedMethod, Marching, Terms, encoder, regrow, whole_grid
+from forewarp.methods.rays import MarchedMethod, Marching, PointField, Terms, encoder, whole_grid
 from forewarp.ops.encode import encoded_size
 from forewarp.ops.grid import huber_variation
 from forewarp.scene.box import Lattice
@@ -110,7 +110,7 @@ class TiNeuVox(MarchedMethod):
 
     def grow(self, num_voxels: float, optimizer: torch.optim.Optimizer) -> None:
         """See ``MarchedMethod``."""
-        regrow(self.grid, self.marching_lattice(num_voxels), optimizer)
+        self.regrow(self.grid, self.marching_lattice(num_voxels), optimizer)
         self.frozen = False
 
     def advance(self, progress: float, step: int, optimizer: torch.optim.Optimizer) -> dict[str, float]:
@@ -151,11 +151,11 @@ class TiNeuVox(MarchedMethod):
         return those_that_hold({padded: self.padded, frozen: self.frozen_from < 1})
 
 
-class TiNeuVoxField:
+class TiNeuVoxField(PointField):
     """TiNeuVox at one moment (see ``PointField``)."""
 
     def __init__(self, method: TiNeuVox, moment: Moment) -> None:
-        self.method = method
+        super().__init__(method)
         self.tau = method.code(method.time_code, moment.time)
         self.camera = None
         if method.camera_code is not None:
@@ -170,7 +170,7 @@ class TiNeuVoxField:
         """``[PE(x), tau]`` (P, I)."""
         return torch.cat([self.method.position(points), self.tau.expand(len(points), -1)], -1)
 
-    def look_up(self, points: Tensor) -> tuple[Tensor, Callable[[Tensor | slice, Tensor], Tensor]]:
+    def at(self, points: Tensor) -> tuple[Tensor, Callable]:
         """See ``PointField``."""
         method, placed = self.method, self._placed(points)
         read = method.feature(method.read(points + method.offsets(placed)))

@@ -131,7 +131,3 @@ class ForwardWarp(VoxelMethod):
     def moved(self, points: Tensor, rows: Tensor, time: float) -> Tensor:
         """Move the canonical voxels ``rows`` (N,) bool, at ``points`` (M, 3), to ``time`` (M, 3)."""
         return points + self.motion.trajectory.flow(self.radiance, time)[rows]
-
-    def displacement(self, points: Tensor, time: float) -> Tensor:
-        """Return the displacement (N, 3) of canonical points at ``time``, in world units; differentiable."""
-        return self.trajectories(points, points.new_tensor([time]))[:, 0] - points

@@ -371,7 +371,7 @@ class VoxelMethod(Method):
 
     def displacement(self, points: Tensor, time: float) -> Tensor:
         """Return how far points (N, 3) are from the canonical time at ``time`` (N, 3); differentiable."""
-        raise NotImplementedError
+        return self.trajectories(points, points.new_tensor([time]))[:, 0] - points
 
     def warm_up(self) -> None:
         """Compile the kernels."""
