@@ -53,7 +53,7 @@ def film(name: str, folder: Path) -> tuple[Path, list]:
 def called(name: str, *words) -> float:
     """Run a command; return its seconds of processor time."""
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
-    command = [sys.executable, "-m", f"forewarp.cli.{name}", *map(str, words)]
+    command = [str(Path(sys.executable).with_name(f"forewarp-{name}")), *map(str, words)]
     subprocess.run(command, check=True, env=os.environ | {"OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"})
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime

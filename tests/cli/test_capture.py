@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -257,7 +258,7 @@ def film(folder, count=20, size=(240, 180)):
 def test_a_video_becomes_a_scene_that_is_trained_also_when_interrupted(ok, in_tmp):
     video, cameras = film(in_tmp)
     words = [f"video={video}", "out=captures/hand", "frames=14", "threads=1"]
-    command = [sys.executable, "-m", "forewarp.cli.capture", *words]
+    command = [str(Path(sys.executable).with_name("forewarp-capture")), *words]
     work = in_tmp / "captures" / ".hand.work"
     before = signal.signal(signal.SIGINT, signal.default_int_handler)  # a job in the background ignores it
     process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=os.environ)

@@ -6,6 +6,7 @@ import subprocess
 import sys
 import threading
 from contextlib import contextmanager
+from pathlib import Path
 
 import imageio.v3 as iio
 import numpy as np
@@ -274,13 +275,8 @@ def test_two_runs_side_by_side(browser, fitted, particles, tmp_path):
 
 
 def test_a_run_is_seen_while_it_trains(browser, fitted, tmp_path):
-    command = [
-        sys.executable,
-        "-u",
-        "-m",
-        "forewarp.cli.train",
-        *words(fitted, 1800),
-    ]  # some 30 s: the page must come before the end
+    script = Path(sys.executable).with_name("forewarp-train")
+    command = [sys.executable, "-u", str(script), *words(fitted, 1800)]  # some 30 s: the page comes before
     command += [f"run={tmp_path}/run", "viewer=true", "port=0"]
     with open(tmp_path / "said", "w") as log:
         process = subprocess.Popen(command, stdout=log, stderr=log, cwd=tmp_path)

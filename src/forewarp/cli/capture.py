@@ -39,7 +39,7 @@ from __future__ import annotations
 import importlib.util
 from pathlib import Path
 
-from forewarp.cli.entry import command
+from forewarp.cli.entry import console_script
 from forewarp.data.files import MARKERS, whole
 from forewarp.files import check_replaceable
 from forewarp.runs.config import check_seed
@@ -147,10 +147,4 @@ def check(config) -> tuple[dict, object]:
     return source, out
 
 
-def main() -> None:
-    """Run the console script."""
-    command("capture", capture, __doc__)
-
-
-if __name__ == "__main__":
-    main()
+main = console_script(__name__)

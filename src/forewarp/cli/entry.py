@@ -27,22 +27,35 @@ MISTAKE, INTERRUPTED = 2, 130
 _MMAP_THRESHOLD, _TRIM_THRESHOLD = -3, -1  # of mallopt, in glibc's malloc.h
 
 
-def command(name: str, task: Callable, text: str, *, config: str | None = None) -> None:
-    """Run a console script: compose ``conf/<name>.yaml`` with the command line and call ``task`` with it.
+def console_script(module: str, config: str | None = None) -> Callable[[], None]:
+    """Make the console script of a module whose function of its own name is the task, and whose docstring the
+    help; ``config`` names the config file if it is not of this name.
+    """
+
+    def main() -> None:
+        """Run the console script."""
+        code, name = sys.modules[module], module.rpartition(".")[2]
+        command(name, getattr(code, name), code.__doc__, config or name)
+
+    return main
+
+
+def command(name: str, task: Callable, text: str, config: str) -> None:
+    """Run a console script: compose ``conf/<config>.yaml`` with the command line and call ``task`` with it.
 
     Never returns. The exit status is 0; 2 after a mistake of the user's, which is told in one line; 1 after a
     bug, with its traceback; 130 after Ctrl-C. ``FOREWARP_TRACEBACK=1`` always shows the traceback.
 
     Args:
-        name: the command's name after ``forewarp-``, and the config file's.
+        name: the command's name after ``forewarp-``.
         task: takes the composed config.
         text: the beginning of ``--help``.
-        config: the name of the config file if it is another.
+        config: the config file's name.
     """
     quiet()
     try:
         if {"-h", "--help"} & set(sys.argv[1:]):
-            print(text.strip() + "\n\n" + choices(project_root() / "conf", config or name), flush=True)
+            print(text.strip() + "\n\n" + choices(project_root() / "conf", config), flush=True)
             sys.exit(0)
         if "--version" in sys.argv[1:]:
             print(f"forewarp {forewarp.__version__}", flush=True)
@@ -53,7 +66,7 @@ def command(name: str, task: Callable, text: str, *, config: str | None = None) 
         failures: list[int] = []
         words = _arguments(name)
         for sys.argv[1:] in commands_of(words) if name == "train" else [words]:
-            failures += _run(name, task, configurations(), config or name)
+            failures += _run(name, task, configurations(), config)
             if any(failures):
                 break
     except KeyboardInterrupt:
@@ -67,7 +80,7 @@ def command(name: str, task: Callable, text: str, *, config: str | None = None) 
             _interrupted(name)
         raise
     except Exception as error:
-        failures = [_tell(name, error, config or name)]
+        failures = [_tell(name, error, config)]
     sys.exit(max(failures, default=0))
 
 

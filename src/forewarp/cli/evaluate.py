@@ -19,7 +19,7 @@ What one types most:
 
 from __future__ import annotations
 
-from forewarp.cli.entry import command
+from forewarp.cli.entry import console_script
 from forewarp.cli.prepare import refuse_numbers
 
 
@@ -48,10 +48,4 @@ def evaluate(config) -> None:
         measure_run(run, module, saved)
 
 
-def main() -> None:
-    """Run the console script."""
-    command("evaluate", evaluate, __doc__)
-
-
-if __name__ == "__main__":
-    main()
+main = console_script(__name__)

@@ -35,7 +35,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from forewarp.cli.entry import command
+from forewarp.cli.entry import console_script
 
 
 def export(config) -> None:
@@ -149,10 +149,4 @@ def check(config, windows: int = 1) -> list[float]:
     return [float(time) for time in times]
 
 
-def main() -> None:
-    """Run the console script."""
-    command("export", export, __doc__)
-
-
-if __name__ == "__main__":
-    main()
+main = console_script(__name__)

@@ -15,7 +15,7 @@ Overrule a plan by an override: forewarp-train plan=FILE model/view_dependence=n
 
 from __future__ import annotations
 
-from forewarp.cli.entry import command
+from forewarp.cli.entry import console_script
 
 
 def plan(config) -> None:
@@ -53,10 +53,4 @@ def planned():
     return config
 
 
-def main() -> None:
-    """Run the console script."""
-    command("plan", plan, __doc__, config="train")
-
-
-if __name__ == "__main__":
-    main()
+main = console_script(__name__, "train")

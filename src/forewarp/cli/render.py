@@ -29,7 +29,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from forewarp.cli.entry import command
+from forewarp.cli.entry import console_script
 
 HALF = 0.5  # share of a pixel, above which it counts as what fills it
 LEAST_SIZE = 400  # pixels of the longer side, unless size= asks for another
@@ -120,10 +120,4 @@ def check(config) -> None:
     refuse_numbers(config, *LEAST, *RANGES)
 
 
-def main() -> None:
-    """Run the console script."""
-    command("render", render, __doc__)
-
-
-if __name__ == "__main__":
-    main()
+main = console_script(__name__)

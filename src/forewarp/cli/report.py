@@ -45,7 +45,7 @@ from pkgutil import resolve_name
 
 from omegaconf import DictConfig, OmegaConf
 
-from forewarp.cli.entry import command
+from forewarp.cli.entry import console_script
 from forewarp.cli.mistakes import one_line
 from forewarp.cli.render import check, write_film
 from forewarp.data.files import number
@@ -204,10 +204,4 @@ def _render(config: DictConfig, row: dict, media) -> None:
     media.video, media.about = write_film(film, run, module), FILMS[film.path]
 
 
-def main() -> None:
-    """Run the console script."""
-    command("report", report, __doc__)
-
-
-if __name__ == "__main__":
-    main()
+main = console_script(__name__)

@@ -32,7 +32,7 @@ Train on it: forewarp-train data=dnerf data.root=scenes data.scene=large
 
 from __future__ import annotations
 
-from forewarp.cli.entry import command
+from forewarp.cli.entry import console_script
 
 
 def synthesize(config) -> None:
@@ -64,10 +64,4 @@ def synthesize(config) -> None:
     print(f"written: {folder}")
 
 
-def main() -> None:
-    """Run the console script."""
-    command("synthesize", synthesize, __doc__)
-
-
-if __name__ == "__main__":
-    main()
+main = console_script(__name__)

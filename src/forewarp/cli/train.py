@@ -56,7 +56,7 @@ from __future__ import annotations
 import re
 from shlex import quote
 
-from forewarp.cli.entry import command
+from forewarp.cli.entry import console_script
 
 # Of a profiler's table: action, calls, seconds in all. The row of the total has no mean.
 _ROW = re.compile(r"^\|\s+(\S.*?)\s*\|\s+\d\S*\s*\|\s+(\d+)\s*\|\s+(\d\S*)\s*\|", re.M)
@@ -155,10 +155,4 @@ def images_of(frames, kind: str) -> str:
     return f"{len(frames)} {kind} images" + (f" ({size})" if size else "")
 
 
-def main() -> None:
-    """Run the console script."""
-    command("train", train, __doc__)
-
-
-if __name__ == "__main__":
-    main()
+main = console_script(__name__)

@@ -23,7 +23,7 @@ from __future__ import annotations
 from importlib.util import find_spec
 from pathlib import Path
 
-from forewarp.cli.entry import command
+from forewarp.cli.entry import console_script
 
 TOLERANCE = 1e-3  # by which two runs' test cameras may differ, of their distance to the origin
 
@@ -97,10 +97,4 @@ def refuse_other_scene(scene, other) -> None:
         raise ValueError(f"{expected}, but got one with other test views")
 
 
-def main() -> None:
-    """Run the console script."""
-    command("view", view, __doc__)
-
-
-if __name__ == "__main__":
-    main()
+main = console_script(__name__)
