@@ -65,8 +65,8 @@ FILM = "video=a.mp4"
         ([FILM, "frames=2"], "frames: expected a whole number of at least 3, but got 2"),
         ([FILM, "size=10"], "size: expected a whole number of at least 64, but got 10"),
         ([FILM, "seed=-1"], r"seed: expected a whole number in \[0, 2147483548\], but got -1"),
-        ([FILM, "lens=FOV"], "lens: expected one of SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL"),
-        ([FILM, "matching=x"], "matching: expected one of auto, sequential, exhaustive, but got 'x'"),
+        ([FILM, "lens=FOV"], "lens: expected SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL"),
+        ([FILM, "matching=x"], "matching: expected auto, sequential or exhaustive, but got 'x'"),
         ([FILM, "out=."], "out: expected a folder to be made, but got ., which you are in"),
         (
             ["images=empty", "out=empty/new"],

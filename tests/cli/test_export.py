@@ -38,7 +38,7 @@ def test_it_writes_what_the_run_has_into_its_folder_and_says_so(forewarp, ok, fi
 @pytest.mark.parametrize(
     ("words", "says"),
     [
-        (["format=stl"], "format: expected one of ply, glb, usd, mesh, gltf, html, npz, but got 'stl'"),
+        (["format=stl"], "format: expected ply, glb, usd, mesh, gltf, html or npz, but got 'stl'"),
         (["layer=still"], "layer: expected all or moving or resting, but got still"),
         (["compressed=9"], "compressed: expected false or true, but got 9"),
         (["times=0"], "times: expected a whole number of at least 1, or a list, but got 0"),

@@ -48,11 +48,11 @@ def test_a_gif_of_small_images_is_larger_and_large_images_keep_their_size(ok, ru
 @pytest.mark.parametrize(
     ("word", "says"),
     [
-        ("path=spiral", "path: expected one of fixed, swing, orbit, both, trajectories, but got 'spiral'"),
+        ("path=spiral", "path: expected fixed, swing, orbit, both or trajectories, but got 'spiral'"),
         ("fps=0", "fps: expected a number in [0.1, 1000], but got 0"),
-        ("format=avi", "format: expected one of mp4, gif, png, but got 'avi'"),
-        ("layer=still", "layer: expected one of all, moving, resting, but got 'still'"),
-        ("masks=folder", "masks: expected true or false, but got folder"),
+        ("format=avi", "format: expected mp4, gif or png, but got 'avi'"),
+        ("layer=still", "layer: expected all, moving or resting, but got 'still'"),
+        ("masks=folder", "masks: expected true or false, but got 'folder'"),
         ("view=99", "view: expected a test view, 0 to 4, but got 99"),
     ],
 )

@@ -22,7 +22,10 @@ def test_the_help_has_a_line_for_each_kind(forewarp):
 @pytest.mark.parametrize(
     ("arguments", "line"),
     [
-        (["kind=prices"], f"kind: expected one of {KINDS}, but got"),
+        (
+            ["kind=prices"],
+            f"kind: expected {KINDS.replace(', run', ' or run')}, but got",
+        ),
         (["target=high"], "target: expected a number of dB or null, but got 'high'"),
         ([], "runs/accuracy_time: expected folders of runs, but got none"),
         (["published=none.yaml"], "none.yaml: expected a usable file or folder, but got No such file"),

@@ -40,7 +40,7 @@ def test_seeds_repeat_a_job_and_nothing_else(ok, refused, in_tmp):
     scene = ["data=dnerf", "data.root=nowhere", "data.scene=x", "absent=skip"]
     done = ok("train", "--multirun", *scene, "seeds=2")
     assert done.out.count("skipped: ") == 2
-    assert "absent: expected refuse or skip, but got maybe" in refused("train", *scene, "absent=maybe")
+    assert "absent: expected refuse or skip, but got 'maybe'" in refused("train", *scene, "absent=maybe")
     line = "seeds: expected --multirun beside seeds=3; add it, or use seed=N"
     assert refused("train", *scene, "seeds=3") == line
 

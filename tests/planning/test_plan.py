@@ -118,7 +118,7 @@ def test_whole_images_get_the_effects_of_whole_images(ok, scenes, in_tmp, monkey
 @pytest.mark.slow
 def test_mistakes_are_one_line(refused, words, in_tmp):
     assert "use model=particles, model=forward or" in refused("plan", "model=tnerf", *words[len(VOXELS) :])
-    assert refused("train", *words, "effects=some") == "effects: expected given or auto, but got some"
+    assert refused("train", *words, "effects=some") == "effects: expected given or auto, but got 'some'"
     assert not (in_tmp / "runs").exists()
 
 

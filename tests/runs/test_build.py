@@ -127,7 +127,7 @@ def test_one_process_trains_a_run(devices, nodes, got):
 
 
 def test_a_profiler_of_another_name_is_refused():
-    with pytest.raises(ValueError, match="trainer.profiler: expected simple, advanced or null, but got slow"):
+    with pytest.raises(ValueError, match="profiler: expected simple, advanced or null, but got 'slow'"):
         build.build_run(config_of("+trainer.profiler=slow"))
 
 

@@ -122,7 +122,7 @@ def test_poses_and_points_may_be_arrays_and_lists(fitted):
         (lambda scene: scene.render(scene.cameras[0], [0.5]), "time: expected a number in [0, 1], but got "),
         (lambda scene: forewarp.look_at([1, 2, 3], [1, 2, 3], [0, 0, 1]), "target: expected another place"),
         (lambda scene: load(scene.folder, device="gpu"), "device: expected cpu"),
-        (lambda scene: scene.frames("tests"), "split: expected one of train, val, test, held"),
+        (lambda scene: scene.frames("tests"), "split: expected train, val, test or held"),
     ],
 )
 def test_what_cannot_be_asked_is_refused_in_a_line(fitted, ask, says):

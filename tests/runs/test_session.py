@@ -77,7 +77,7 @@ def test_a_folder_is_claimed_for_one_config(tmp_path):
 def test_data_that_changed_are_refused_unless_accepted(tmp_path, capsys):
     data = {"texts": {"a.json": "1"}, "images": {"count": 1}}
     run = SimpleNamespace(folder=tmp_path, datamodule=SimpleNamespace(fingerprint=lambda: data))
-    with pytest.raises(ValueError, match="data_changed: expected one of refuse, accept, but got x"):
+    with pytest.raises(ValueError, match="data_changed: expected refuse or accept, but got 'x'"):
         check_data(run, "x")
     check_data(run, "refuse")
     data = data | {"texts": {"a.json": "2"}}

@@ -40,7 +40,7 @@ import importlib.util
 from pathlib import Path
 
 from forewarp.cli.entry import console_script
-from forewarp.data.files import MARKERS, whole
+from forewarp.data.files import MARKERS, one_of, whole
 from forewarp.files import check_replaceable
 from forewarp.runs.config import check_seed
 from forewarp.runs.overrides import command_line, text_override
@@ -107,10 +107,8 @@ def check(config) -> tuple[dict, object]:
         if needed != given[0]:
             advice = "set images=" if key == "colmap" else "remove it"
             raise ValueError(f"{key}: expected {needed}=FOLDER beside it, but got {given[0]}=; {advice}")
-    if type(config.force) is not bool:
-        raise ValueError(f"force: expected true or false, but got {config.force}")
-    if type(config.fixed) not in (bool, type(None)):
-        raise ValueError(f"fixed: expected true, false or null, but got {config.fixed}")
+    one_of(config.force, "force", True, False)
+    one_of(config.fixed, "fixed", True, False, None)
     if config.rate is not None and not (type(config.rate) in (int, float) and 0 < config.rate < 1e6):
         raise ValueError(f"rate: expected pictures a second, above 0, but got {config.rate}")
     if isinstance(name := config.without, str):
@@ -124,9 +122,8 @@ def check(config) -> tuple[dict, object]:
         if config[key] is not None or key == "features":
             whole(config[key], key, least)
     check_seed(config.seed)
-    for key, known in (("matching", MATCHING), ("lens", LENSES)):
-        if config[key] not in known:
-            raise ValueError(f"{key}: expected one of {', '.join(known)}, but got '{config[key]}'")
+    one_of(config.matching, "matching", *MATCHING)
+    one_of(config.lens, "lens", *LENSES)
     if typed := [key for key in ("masks", "colmap") if is_scan(video) and source[key] is not None]:
         raise ValueError(f"{typed[0]}: expected none beside a scan of Record3D, but got one; remove it")
     for package in ("pycolmap", "cv2", *(["lzfse"] if is_scan(video) else [])):

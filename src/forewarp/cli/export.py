@@ -119,11 +119,11 @@ def check(config, windows: int = 1) -> list[float]:
     """
     from omegaconf import ListConfig
 
+    from forewarp.data.files import one_of
     from forewarp.export.formats import FORMATS, check_option, require
     from forewarp.runs.overrides import key_of, typed_overrides
 
-    if config.format not in FORMATS:
-        raise ValueError(f"format: expected one of {', '.join(FORMATS)}, but got '{config.format}'")
+    one_of(config.format, "format", *FORMATS)
     form, name = FORMATS[config.format], f"format={config.format}"
     if windows > 1 and form.times:
         expected = "format: expected glb or html for a film's windows"

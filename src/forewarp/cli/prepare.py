@@ -5,6 +5,7 @@ What is wrong with a command by itself is refused before torch is loaded, so a m
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
@@ -16,7 +17,7 @@ from omegaconf import DictConfig
 
 from forewarp.cli.mistakes import of_another
 from forewarp.cli.view import require_viewer
-from forewarp.data.files import number, scene_folder, whole
+from forewarp.data.files import number, one_of, scene_folder, whole
 from forewarp.files import MOST_CONFIG, read_text, replace_file
 from forewarp.runs.config import check_planned, check_values, hashed, is_swept, resumed, trust_of
 from forewarp.runs.overrides import key_of, typed_overrides
@@ -26,14 +27,8 @@ if TYPE_CHECKING:  # loads torch
     from forewarp.training.stages import Run
 
 # What our data modules read; those of others, and those that make their scene, check for themselves.
-READERS = {
-    "DNeRFDataModule": "dnerf",
-    "LegoCompleteDataModule": "lego_complete",
-    "HyperNeRFDataModule": "hypernerf",
-    "NHRDataModule": "nhr",
-    "MulticamDataModule": "multicam",
-    "PosedVideoDataModule": "posed_video",
-}
+READERS = {"DNeRF": "dnerf", "LegoComplete": "lego_complete", "HyperNeRF": "hypernerf", "NHR": "nhr"}
+READERS |= {"Multicam": "multicam", "PosedVideo": "posed_video"}
 VOXELS, PARTICLES = "forewarp.methods.voxel.", "forewarp.methods.particles."
 
 CHOICES = {"effects": ("given", "auto"), "absent": ("refuse", "skip")}
@@ -136,8 +131,7 @@ def prepare(config: DictConfig) -> Prepared | None:
 def refuse_all(config: DictConfig) -> None:
     """Refuse what is wrong with a config by itself, whatever the data."""
     for key, choices in CHOICES.items():
-        if config.get(key, choices[0]) not in choices:
-            raise ValueError(f"{key}: expected {' or '.join(choices)}, but got {config[key]}")
+        one_of(config.get(key, choices[0]), key, *choices)
     refuse_seeds(config)
     model, ablation = config.model.name, config.get("variant") or {}
     if model not in ablation.get("of", [model]):
@@ -157,9 +151,9 @@ def refuse_missing_scene(config: DictConfig) -> None:
     Raises:
         SceneError: listing the scenes that are there.
     """
-    reader = READERS.get(str(config.data.get("_target_")).removeprefix("forewarp.data.module."))
-    if reader is not None and config.get("absent", "refuse") == "refuse":
-        scene_folder(Path(config.data.root).expanduser(), str(config.data.scene), reader)
+    ours = re.fullmatch(r"forewarp\.data\.module\.(\w+)DataModule", str(config.data.get("_target_")))
+    if ours and ours[1] in READERS and config.get("absent", "refuse") == "refuse":
+        scene_folder(Path(config.data.root).expanduser(), str(config.data.scene), READERS[ours[1]])
 
 
 def refuse_missing_start(config: DictConfig) -> None:
@@ -225,10 +219,9 @@ def refuse_numbers(config: DictConfig, *keys: str) -> None:
 
 def viewer_of(config: DictConfig) -> dict | None:
     """Return where a page should listen, None if none is asked for; refuse one that cannot be made."""
-    viewer, port = config.get("viewer", False), config.get("port")
-    if type(viewer) is not bool:
-        raise ValueError(f"viewer: expected true or false, but got {viewer}")
-    if not viewer:
+    port = config.get("port")
+    one_of(config.get("viewer", False), "viewer", True, False)
+    if not config.get("viewer"):
         return None
     require_viewer()
     from forewarp.viewer.server import check_address

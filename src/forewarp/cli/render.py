@@ -107,16 +107,15 @@ def pictures_of(config, module, datamodule, masks: Path, progress):
 def check(config) -> None:
     """Refuse settings of which no video can be made, before anything is loaded."""
     from forewarp.cli.prepare import LEAST, RANGES, refuse_numbers
+    from forewarp.data.files import one_of
     from forewarp.drawing.images import FORMATS
     from forewarp.evaluation.images import PATHS
     from forewarp.evaluation.layers import LAYERS
 
     for key, known in (("path", PATHS), ("format", FORMATS), ("layer", LAYERS)):
-        if config[key] not in known:
-            raise ValueError(f"{key}: expected one of {', '.join(known)}, but got '{config[key]}'")
+        one_of(config[key], key, *known)
     config.masks = str(config.masks).lower()  # typed, it is text, as the folder of forewarp-capture is
-    if config.masks not in ("true", "false"):
-        raise ValueError(f"masks: expected true or false, but got {config.masks}")
+    one_of(config.masks, "masks", "true", "false")
     refuse_numbers(config, *LEAST, *RANGES)
 
 

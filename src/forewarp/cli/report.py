@@ -48,7 +48,7 @@ from omegaconf import DictConfig, OmegaConf
 from forewarp.cli.entry import console_script
 from forewarp.cli.mistakes import one_line
 from forewarp.cli.render import check, write_film
-from forewarp.data.files import number
+from forewarp.data.files import number, one_of
 from forewarp.runs.config_files import project_root
 
 # Where the runs of a kind are if none are named, what writes its page, and the options that it takes.
@@ -62,15 +62,13 @@ KINDS = {
     "effects": ("effects", "choices.write_effects", ()),
     "search": ("search", "choices.write_search", ()),
 }
-NAMES = (*KINDS, "compare", "run")
 MEGABYTES = 0.3, 1000  # least and most that may be asked for
 MOST_SIDE = 800  # pixels of a picture's longer side
 
 
 def report(config: DictConfig) -> None:
     """Write the page, or print the table."""
-    if config.kind not in NAMES:
-        raise ValueError(f"kind: expected one of {', '.join(NAMES)}, but got '{config.kind}'")
+    one_of(config.kind, "kind", *KINDS, "compare", "run")
     if not isinstance(config.target, int | float | None):
         raise ValueError(f"target: expected a number of dB or null, but got '{config.target}'")
     if config.kind == "run":
@@ -131,10 +129,8 @@ def run_page(config: DictConfig) -> str:
     from forewarp.report.run_page import FILMS, media_of, read_story, room_of, write_run_page
 
     number(config.megabytes, "megabytes", *MEGABYTES)
-    if type(config.render) is not bool:
-        raise ValueError(f"render: expected true or false, but got {config.render}")
-    if config.path not in (None, *FILMS):
-        raise ValueError(f"path: expected one of {', '.join(FILMS)} or null, but got '{config.path}'")
+    one_of(config.render, "render", True, False)
+    one_of(config.path, "path", *FILMS, None)
     if config.run is None:
         got, name = ("runs=", "<a run's folder>") if config.runs is not None else ("nothing", "runs/...")
         raise ValueError(f"run: expected the folder of a run, but got {got}; set run={name}")

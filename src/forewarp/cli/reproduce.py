@@ -50,6 +50,7 @@ from types import SimpleNamespace
 import yaml
 
 from forewarp.cli.entry import INTERRUPTED, MISTAKE, project_root
+from forewarp.data.files import one_of
 from forewarp.runs.overrides import merged
 
 # Keys that may be typed, with what they are where they are left out.
@@ -122,8 +123,7 @@ class Keys(SimpleNamespace):
             ValueError: for another one.
         """
         model = self.model or "particles"
-        if model not in ("particles", "forward"):
-            raise ValueError(f"model: expected particles or forward, but got {model}")
+        one_of(model, "model", "particles", "forward")
         return model
 
 

@@ -18,7 +18,7 @@ from forewarp.files import read_json, replace_file
 from forewarp.metrics.gain import FACTORS, Estimate, measure_effect
 from forewarp.metrics.registry import METRICS, metric_of
 from forewarp.report.figures import draw_scene
-from forewarp.report.results import KINDS, PLACES, Point, Row, Runs, overrides, portable, read_runs
+from forewarp.report.results import KINDS, PLACES, Point, Row, Runs, overrides, read_runs
 from forewarp.report.tables import Column, Difference, Table, rendered, score_columns
 
 COSTS = {"epe": Column("EPE", 4), "step": Column("s/step", 3), "frame": Column("s/frame")}
@@ -101,7 +101,7 @@ def cheapest(groups: Mapping[tuple, Runs]) -> Table:
         times = [(reached(group, psnr), group[0]) for group in groups.values()]
         if known := [(seconds, row) for seconds, row in times if seconds is not None]:
             seconds, row = min(known, key=lambda pair: pair[0].mean)
-            lines.append([str(psnr), seconds, row["variant"], f"`{portable(row['command'])}`"])
+            lines.append([str(psnr), seconds, row["variant"], f"`{row['command']}`"])
     columns = ["for dB", Column("seconds", 1), "variant", "command"]
     return Table(columns, lines, "The cheapest way to each PSNR:")
 
@@ -131,8 +131,8 @@ def write_price_list(folder: Path, out: Path) -> list[Path]:
         scenes.append({"title": f"{scene}, {bound}", "tables": [references(found), changes(found)]})
     model = mode([row["method"] for row in runs] or ["forward"])
     page = out / ("price-list.md" if model == "forward" else f"price-list-{model}.md")
-    text = rendered("price_list.md.j2", machine=runs.machines(), scenes=scenes, left_out=left_out)
-    replace_file(page, text)
+    about = {"machine": runs.machines(), "left_out": left_out}
+    replace_file(page, rendered("price_list.md.j2", scenes=scenes, **about))
     replace_file(page.with_suffix(".csv"), every_run(runs).csv())
     return [page, page.with_suffix(".csv")]
 
@@ -177,7 +177,7 @@ def every_run(runs: Runs) -> Table:
     """List the numbers of every run."""
     columns = {name: name for name in ("scene", "variant", "minutes", "seed")} | {"ability": "views"}
     columns |= measures_of(runs) | {"effects": "effects", "command": "command"}
-    return Table.of((row | {"command": portable(row["command"])} for row in runs), columns)
+    return Table.of(runs, columns)
 
 
 def write_effects(folder: Path, out: Path) -> list[Path]:
@@ -198,10 +198,8 @@ def write_effects(folder: Path, out: Path) -> list[Path]:
         why = [[scene, name.replace("_", " "), d["choice"], d["because"]] for scene, name, d in decisions]
         reasons = Table(["scene", "effect", "choice", "because"], why)
         replace_file(page, rendered("effects.md.j2", **about, table=choices(newest), reasons=reasons))
-        lines = [
-            row | {"planning": row["plan"].get("seconds"), "command": portable(row["command"])}
-            for row in chain(*own.by("scene", "ablation", "seed").values())
-        ]
+        rows = chain(*own.by("scene", "ablation", "seed").values())
+        lines = [row | {"planning": row["plan"].get("seconds")} for row in rows]
         replace_file(page.with_suffix(".csv"), Table.of(lines, columns).csv())
         files += [page, page.with_suffix(".csv")]
     return files
@@ -277,7 +275,7 @@ def _scored(row: Row) -> list[Row]:
 def _trials(trials: Sequence[Row], score: Column) -> Table:
     """List trials by the overrides in which they differ."""
     typed = [dict(word.partition("=")[::2] for word in overrides(row["command"])) for row in trials]
-    keys = dict.fromkeys(key for words in typed for key in words if key not in ("run", "forewarp-train"))
+    keys = dict.fromkeys(key for words in typed for key in words if key != "forewarp-train")
     chosen = [key for key in keys if len({words.get(key) for words in typed}) > 1]
     cells = [[_value(words.get(key)) for key in chosen] for words in typed]
     ends = [[row["score"], row["steps"], row["seconds"]] for row in trials]
@@ -290,7 +288,7 @@ def _again(row: Row) -> dict:
     """Return the command that trains a trial's choices in a folder of their own, and the words in it that
     stand for folders.
     """
-    command = portable(row["command"])
+    command = row["command"]
     typed = {word.partition("=")[0] for word in overrides(command)}
     if "#" not in command and "experiment" not in typed:  # a sweep's file may have chosen these
         chosen = {"model": row["method"], "preset": row["preset"]}

@@ -22,7 +22,7 @@ from forewarp.metrics.gain import Estimate, pooled_deviation
 from forewarp.metrics.registry import metric_of
 from forewarp.report import figures
 from forewarp.report.choices import every_run
-from forewarp.report.results import KINDS, Point, Row, Runs, grouped, portable, read_runs
+from forewarp.report.results import KINDS, Point, Row, Runs, grouped, read_runs
 from forewarp.report.tables import Cell, Column, Difference, Section, Table, rendered
 
 PAPER = Path(__file__).with_name("paper.yaml")  # the printed numbers
@@ -404,7 +404,7 @@ def facts(runs: Runs, numbers: Mapping[str, int]) -> list[str]:
         f"machine: {runs.machines()}",
         f"budget: {'; '.join(sorted(budgets))}",
         f"date: {runs.days()}",
-        f"command{f', one of {count} runs' * (count > 1)}: {portable(runs[0]['command'])}",
+        f"command{f', one of {count} runs' * (count > 1)}: {runs[0]['command']}",
     ]
 
 

@@ -28,18 +28,10 @@ from forewarp.metrics.registry import metric_of
 Row = dict
 
 # Rows that differ in these are not compared; how each is named where rows differ in it.
-CONDITIONS = {
-    "clock": "{} clock",
-    "threads": "threads: {:g}",
-    "device": "{}",
-    "measured": "{}",
-    "pictures": "{}",
-    "iterations": "{:g} steps at most",
-    "held_out": "{:g} views held out",
-    "train_views": "{:g} training views",
-    "density": "stage.fine.density={:g}",
-    "steps_per_picture": "stage.fine.steps_per_picture={}",
-}
+CONDITIONS = {"clock": "{} clock", "threads": "threads: {:g}", "device": "{}", "measured": "{}"}
+CONDITIONS |= {"pictures": "{}", "iterations": "{:g} steps at most", "held_out": "{:g} views held out"}
+CONDITIONS |= {"train_views": "{:g} training views", "density": "stage.fine.density={:g}"}
+CONDITIONS |= {"steps_per_picture": "stage.fine.steps_per_picture={}"}
 KEY = ("method", "preset", "scene", "minutes", "seed", *CONDITIONS)
 SCORES = ("psnr", "ssim", "lpips")  # that a table has, whether measured or not
 NUMBERS = ("steps", "step", "frame", "parameters", "memory", "ends", "motion_error")
@@ -47,12 +39,8 @@ NUMBERS += ("psnr_space", "psnr_time", "psnr_canonical", "size", "wall", "proces
 TEXTS = ("dataset", "day", "commit", "departures", "faults", "views", "curve", "command")
 # Kinds of test view, and parts of their pixels, that scores are of.
 KINDS = {"space": "at training times", "time": "between training times", "canonical": "at the canonical time"}
-KINDS |= {
-    "space_time": "of cameras and between times held out",
-    "all": "all",
-    "moving": "what moves",
-    "still": "what is still",
-}
+KINDS |= {"space_time": "of cameras and between times held out", "all": "all"}
+KINDS |= {"moving": "what moves", "still": "what is still"}
 COUNTERPART = "counterpart of "  # begins the dataset of synthetic scenes that stand in for its own
 NETS = ("vgg", "alex", "squeeze")  # LPIPS in tables is of the first whose weights were there
 # What pages tell of a run's protocol.
@@ -167,14 +155,14 @@ class Runs(list[Row]):
 
         A sweep's clock and threads, which are not typed, are added. None if no command is known.
 
-        >>> row = {"command": "forewarp-train seed=1 scene=s model=a run=r", "clock": "wall", "threads": 2}
+        >>> row = {"command": "forewarp-train seed=1 scene=s model=a", "clock": "wall", "threads": 2}
         >>> Runs([row, row | {"command": "forewarp-train scene=s model=b"}]).command()
         {'shared': 'forewarp-train scene=s threads=2', 'varied': ['`model=a,b`']}
         """
         commands = []
         for row in self:
             if "#" not in (row["command"] or "#"):  # this sign begins a comment in place of a lost command
-                typed = re.sub(r"\s(seed|budget\.clock|threads)=\S+", "", portable(row["command"]))
+                typed = re.sub(r"\s(seed|budget\.clock|threads)=\S+", "", row["command"])
                 typed += f" budget.clock={row['clock']}" if row["clock"] != "wall" else ""
                 typed += f" threads={row['threads']:g}" if row["threads"] else ""
                 commands.append(overrides(typed))
@@ -199,7 +187,7 @@ def grouped(pairs: Iterable[tuple]) -> dict[object, list]:
 
 def read_runs(root: Path, needed: Sequence[str] = ("metrics.json",)) -> tuple[Runs, list[str]]:
     """Read all runs below a folder but those for debugging, which are too short to be compared, and a plan's
-    short fits.
+    short fits; with their commands as of ``portable``.
 
     Args:
         root: folder to search for ``config.yaml``.
@@ -219,6 +207,7 @@ def read_runs(root: Path, needed: Sequence[str] = ("metrics.json",)) -> tuple[Ru
         absent = [name for name in needed if not (folder / name).is_file()]
         try:
             row = read_run(folder)
+            row["command"] = portable(row["command"])
         except ValueError as error:
             left_out.append(f"{folder.relative_to(root)}: cannot be read ({error})")
             continue
@@ -277,11 +266,11 @@ def read_run(folder: Path) -> Row:
     plan = read_text(folder / "plan.yaml", MOST_CONFIG) if (folder / "plan.yaml").is_file() else "{}"
     points, images = read_points(folder), []
     for image in (read_json(folder / "per_image.json") or {}).get("images", []):
-        scores = {name: float(value) for name, value in image["scores"].items() if value is not None}
-        scores = {name: value for name, value in scores.items() if math.isfinite(value)}
-        if "psnr" in scores and math.isfinite(time := float(image["time"])):
+        found = {name: float(value) for name, value in image["scores"].items() if value is not None}
+        found = {name: value for name, value in found.items() if math.isfinite(value)}
+        if "psnr" in found and math.isfinite(time := float(image["time"])):
             of_image = {"name": str(image.get("name")), "time": time, "ability": str(image.get("ability"))}
-            images.append({**of_image, "psnr": scores["psnr"], "scores": scores})
+            images.append(of_image | {"psnr": found["psnr"], "scores": found})
     images.sort(key=lambda image: image["name"])
 
     protocol, test, flow, sizes = (metrics.get(key) or {} for key in ("protocol", "test", "flow", "size"))
@@ -357,21 +346,18 @@ def read_compared(folders: Sequence[str | Path]) -> dict[str, Row]:
             raise ValueError(f"{numbers}: expected a run's numbers, but got none; make them with {again}")
         with refused(f"{path}: expected a measured run, but got ", f"; measure it with {again}"):
             rows.append(read_run(path))
-    choices = (
-        [row["metrics"].get("protocol", {}).get("method", path.name) for row, path in zip(rows, paths)],
-        [path.resolve().name for path in paths],
-        [path.as_posix() for path in paths],
-        [f"{number} {path.as_posix()}" for number, path in enumerate(paths, 1)],
-    )
+    methods = [row["metrics"].get("protocol", {}).get("method", path.name) for row, path in zip(rows, paths)]
+    folders, places = [path.resolve().name for path in paths], [path.as_posix() for path in paths]
+    choices = methods, folders, places, [f"{number} {place}" for number, place in enumerate(places, 1)]
     return dict(zip(next(names for names in choices if len(set(names)) == len(names)), rows))
 
 
 def read_points(folder: Path) -> tuple[Point, ...]:
     """Read the rows of a run's ``accuracy_time.csv``; a missing file has none."""
-    return tuple(
-        Point(float(row["seconds"]), float(row["psnr"]), int(row["step"]), _number(row["epe_moving"]))
-        for row in read_rows(folder / "accuracy_time.csv")
-    )
+    rows = read_rows(folder / "accuracy_time.csv")
+    names = "seconds", "psnr", "step", "epe_moving"
+    told = ([row[name] for name in names] for row in rows)
+    return tuple(Point(float(at), float(psnr), int(step), _number(epe)) for at, psnr, step, epe in told)
 
 
 def pictures_in_words(protocol: dict) -> str | None:
@@ -424,7 +410,6 @@ def add_to_table(file: Path, rows: Iterable[Row]) -> Runs:
         ValueError: if there would be no row.
     """
     known = [_read(row) for row in read_rows(file)]
-    rows = [row | {"command": portable(row["command"])} for row in rows]
     known += sorted(rows, key=lambda row: row["measured_at"])
     if not known:
         expected = "measured runs that ended after minutes, but got none; set budget.minutes"

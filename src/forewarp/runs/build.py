@@ -15,7 +15,7 @@ from lightning.pytorch.profilers import AdvancedProfiler, SimpleProfiler
 from omegaconf import DictConfig, OmegaConf
 
 from forewarp.clock import Clock
-from forewarp.data.files import whole
+from forewarp.data.files import one_of, whole
 from forewarp.data.films import FOLDER
 from forewarp.runs.config import IDENTITY, instead_of, plain, saved_config, trust_of
 from forewarp.runs.overrides import TEXTS, key_of
@@ -48,8 +48,7 @@ def build_run(config: DictConfig) -> Run:
     factories = [make for make in instantiate(config.callbacks, _convert_="all").values() if make is not None]
     trainer = instantiate(config.trainer, _convert_="all")
     name = config.trainer.get("profiler")
-    if name is not None and name not in PROFILERS:
-        raise ValueError(f"trainer.profiler: expected simple, advanced or null, but got {name}")
+    one_of(name, "trainer.profiler", *PROFILERS, None)
     profiler = PROFILERS.get(name)  # writes a table of calls into the stage's folder
 
     def make_trainer(folder: Path, callbacks: list, loggers: list):

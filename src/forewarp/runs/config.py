@@ -23,7 +23,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from forewarp.data.files import RECORD, number
+from forewarp.data.files import RECORD, number, one_of
 from forewarp.files import MOST_CONFIG, read_text, refuse_links
 from forewarp.runs.overrides import constant, key_of, typed_overrides
 
@@ -60,15 +60,8 @@ _NO_TRAINERS = dict.fromkeys(("ddp", "ddp_spawn", "ddp_sim", "fsdp", "deepspeed"
 _NO_TRAINERS["mps"] = "Apple's GPUs have no float64, which cameras and the cosine basis need: use trainer=cpu"
 _RESERVED = {"_target_", "_partial_", "_recursive_", "_convert_"}
 # What OmegaConf and PyYAML raise for a text that is no config.
-_UNREADABLE = (
-    yaml.YAMLError,
-    OmegaConfBaseException,
-    ValueError,
-    TypeError,
-    AssertionError,
-    OverflowError,
-    RecursionError,
-)
+_UNREADABLE = yaml.YAMLError, OmegaConfBaseException, ValueError, TypeError
+_UNREADABLE += AssertionError, OverflowError, RecursionError
 _PARTS = {"name", "version", "sub_dir"}  # keys that make up the path a logger writes to
 # Its others.
 _PLAIN = {"default_hp_metric", "flush_logs_every_n_steps", "log_graph", "prefix"}
@@ -239,8 +232,7 @@ def check_values(config: DictConfig) -> None:
     for key in ("seed", "data.seed", "data.synthesis.seed"):
         if key == "seed" or OmegaConf.select(config, key) is not None:
             check_seed(OmegaConf.select(config, key), key)
-    if type(config.get("evaluate", True)) is not bool:
-        raise ValueError(f"evaluate: expected true or false, but got {config.evaluate}")
+    one_of(config.get("evaluate", True), "evaluate", True, False)
     weights = config.get("lpips_weights")
     places = weights if OmegaConf.is_list(weights) else [] if weights is None else [weights]
     if not all(isinstance(place, str) for place in places):

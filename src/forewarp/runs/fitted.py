@@ -18,6 +18,7 @@ from torch import Tensor
 
 from forewarp.data.batches import COLORS, color_of
 from forewarp.data.checks import blind_frames, bounds
+from forewarp.data.files import one_of
 from forewarp.evaluation.evaluate import evaluate, mean_scores, show
 from forewarp.fields.moving import MovingGaussians
 from forewarp.fields.windows import MovingWindows
@@ -77,10 +78,7 @@ class Renderable:
         return mean_up(self.cameras)
 
     def render(
-        self,
-        view: Frame | Camera | Vector,
-        time: float | None = None,
-        background: str | Vector | None = None,
+        self, view: Frame | Camera | Vector, time: float | None = None, background: str | Vector | None = None
     ) -> Rendering:
         """Render the scene.
 
@@ -202,8 +200,7 @@ class Fitted(Renderable):
 
     def frames(self, split: str = "test") -> tuple[Frame, ...]:
         """List the frames of ``train``, ``val``, ``test`` or ``held``: names, times, cameras, pictures."""
-        if split not in SPLITS:
-            raise ValueError(f"split: expected one of {', '.join(SPLITS)}, but got {split!r}")
+        one_of(split, "split", *SPLITS)
         return getattr(self.scene, split)
 
 
@@ -234,15 +231,9 @@ class SceneFile(Renderable):
 def open_file(file: Path, device: str = "cpu") -> SceneFile:
     """Open a ``scene.glb``; see ``forewarp.load``."""
     held = read(file)
-    setting = held.setting
-    return SceneFile(
-        method=held.gaussians.to(device),
-        name="particles",
-        place=file,
-        cameras=list(setting.cameras),
-        background=torch.tensor(setting.background),
-        seconds=setting.seconds,
-    )
+    method, setting = held.gaussians.to(device), held.setting
+    background = torch.tensor(setting.background)
+    return SceneFile(method, "particles", file, list(setting.cameras), background, setting.seconds)
 
 
 def opened(config: DictConfig, device: str | torch.device | None = None) -> tuple[Run, DynamicSceneModule]:
@@ -265,11 +256,7 @@ def opened(config: DictConfig, device: str | torch.device | None = None) -> tupl
 
 
 def open_run(
-    run: str | Path,
-    *,
-    trust: Sequence[str] | str = (),
-    device: str = "cpu",
-    data_root: str | Path | None = None,
+    run: str | Path, *, trust: Sequence[str] = (), device: str = "cpu", data_root: str | Path | None = None
 ) -> Fitted | SceneFile:
     """Load a finished run from its folder, or a scene from a file; see ``forewarp.load``."""
     if device != "cpu" and not (str(device).startswith("cuda") and torch.cuda.is_available()):
@@ -282,17 +269,9 @@ def open_run(
     changes = {"trust": list(trust_of(trust)), "data": {"root": root}}
     config = saved_config(str(run), OmegaConf.create(changes))
     made, module = opened(config, device)
-    scene = made.datamodule.scene
-    return Fitted(
-        method=module.method,
-        name=config.model.name,
-        place=run,
-        cameras=[frame.camera for frame in scene.train],
-        background=made.datamodule.targets("test").background,
-        config=config,
-        module=module,
-        scene=scene,
-    )
+    scene, background = made.datamodule.scene, made.datamodule.targets("test").background
+    cameras = [frame.camera for frame in scene.train]
+    return Fitted(module.method, config.model.name, run, cameras, background, config, module, scene)
 
 
 def measure_run(run: Run, module: DynamicSceneModule, config: DictConfig) -> dict:
@@ -316,9 +295,8 @@ def measure_run(run: Run, module: DynamicSceneModule, config: DictConfig) -> dic
 
 def log_scores(run: Run, metrics: dict) -> None:
     """Log the scores of ``metrics.json`` to the run's loggers, as ``test/space/psnr``."""
-    scores = {
-        f"test/{split}/{name}": score for split, of in metrics["test"].items() for name, score in of.items()
-    }
+    kinds = metrics["test"].items()
+    scores = {f"test/{kind}/{name}": score for kind, of in kinds for name, score in of.items()}
     scores |= {"test/seconds": sum(metrics["seconds"].values())}
     run.loggers.log_scores(scores, sum(done["steps"] for done in run.finished().values()))
 

@@ -14,7 +14,7 @@ from filelock import FileLock, Timeout
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
-from forewarp.data.files import LOCK, difference
+from forewarp.data.files import LOCK, difference, one_of
 from forewarp.files import read_json, read_text, refuse_links, replace_file, write_json
 from forewarp.runs.config import IDENTITY, NOT_OF_RUN, make_absolute, read_config
 from forewarp.runs.overrides import command_line, typed_folders, typed_overrides
@@ -151,8 +151,7 @@ def check_data(run: Run, changed: str) -> None:
     Raises:
         ValueError: naming what changed.
     """
-    if changed not in ("refuse", "accept"):
-        raise ValueError(f"data_changed: expected one of refuse, accept, but got {changed}")
+    one_of(changed, "data_changed", "refuse", "accept")
     path, recorded, now, differs = _compared(run)
     if differs and changed == "refuse":
         raise ValueError(f"{differs}; use run=..., or go on with data_changed=accept")
