@@ -68,7 +68,6 @@ class Fade:
         gone = [share for share in self.shares if share > _TOLD]
         if not gone:
             return None
-        return (
-            f"{len(gone)} of {len(self.shares)} images show what no training image shows, up to "
-            f"{max(gone):.0%} of one: it fades to black (path=swing stays where it was filmed)"
-        )
+        many, most = f"{len(gone)} of {len(self.shares)} images", f"up to {max(gone):.0%} of one"
+        faded = "it fades to black (path=swing stays where it was filmed)"
+        return f"{many} show what no training image shows, {most}: {faded}"

@@ -102,12 +102,9 @@ def _decided(
     # The method and all choices: defaults may change.
     overrides = [f"model={choices['model']}", *base[len(typed) :]]
     overrides += [f"model/{d.effect}={d.choice}" for d in decisions if d.effect not in of_user]
-    return {
-        "typed": list(typed),
-        "overrides": overrides,
-        "effects": {d.effect: {"choice": d.choice, "on": d.on, "because": d.because} for d in decisions},
-        "evidence": {name: value for name, value in asdict(evidence).items() if value is not None},
-    }, seconds
+    effects = {d.effect: {"choice": d.choice, "on": d.on, "because": d.because} for d in decisions}
+    known = {name: value for name, value in asdict(evidence).items() if value is not None}
+    return {"typed": list(typed), "overrides": overrides, "effects": effects, "evidence": known}, seconds
 
 
 def is_of(key: str, effect: str) -> bool:

@@ -19,8 +19,8 @@ import yaml
 from forewarp.files import MOST_CONFIG, read_rows, read_text, replace_file
 from forewarp.metrics.gain import Estimate
 from forewarp.metrics.registry import metric_of
-from forewarp.report import figures
-from forewarp.report.results import CONDITIONS, Runs, add_to_table, in_words, key_of, length, pairs, read_runs
+from forewarp.report import figures, results
+from forewarp.report.results import CONDITIONS, Runs, grouped, in_words, key_of, length, pairs
 from forewarp.report.tables import Column, Table, rendered, score_columns
 
 OTHERS = Path(__file__).with_name("published.yaml")  # results of others
@@ -73,7 +73,9 @@ def write_minutes(folder: Path, out: Path, published: Sequence[Published] = ()) 
     for file in out.glob("*.csv"):  # of earlier calls
         named = {row.get("method") for row in read_rows(file)}
         methods |= named if named == {file.stem} and file.with_suffix(".md").is_file() else set()
-    rows = {name: add_to_table(out / f"{name}.csv", runs.where(method=name)) for name in sorted(methods)}
+    rows = {
+        name: results.add_to_table(out / f"{name}.csv", runs.where(method=name)) for name in sorted(methods)
+    }
     tables = {method: labelled(own) for method, own in rows.items()}
     for method, own in tables.items():
         others = {other: found for other, found in tables.items() if other != method}
@@ -81,9 +83,7 @@ def write_minutes(folder: Path, out: Path, published: Sequence[Published] = ()) 
         replace_file(page, rendered("minutes.md.j2", left_out=left_out, **_of_method(method, own, others)))
         scenes = {}
         for group in alike(plain(own)):
-            by_time: dict[float, list[float]] = {}
-            for time, psnr in chain(*(pairs(row["views"]) for row in group)):
-                by_time.setdefault(time, []).append(psnr)
+            by_time = grouped(chain(*(pairs(row["views"]) for row in group)))
             label = f"{length(group[0]['minutes'])}, {len(group)} seed{'s' * (len(group) > 1)}"
             means = {label: [(time, fmean(by_time[time])) for time in sorted(by_time)]} if by_time else {}
             scenes.setdefault(group[0]["label"], {}).update(means)
@@ -94,7 +94,7 @@ def write_minutes(folder: Path, out: Path, published: Sequence[Published] = ()) 
 
 def _timed(folder: Path) -> tuple[Runs, list[str]]:
     """Read the measured runs of so many minutes, the newest of equal ones; and a line for each other run."""
-    runs, left_out = read_runs(folder)
+    runs, left_out = results.read_runs(folder)
     endless = [(row, "no budget.minutes") for row in runs.where(minutes=None)]
     runs, older = Runs(row for row in runs if row["minutes"] is not None).newest("method", "seed", *TASK)
     unused = [*endless, *((row, "another run of the same is newer") for row in older)]
@@ -201,9 +201,7 @@ def _by_minutes(runs: Runs) -> Table:
 def _against_fewer(runs: Runs, varied: str, order: Callable[[Runs], float]) -> list[dict]:
     """List groups that differ in one thing alone, each with how its PSNR is to that of the group before."""
     shared, lines = [name for name in TASK if name != varied], []
-    series: dict[tuple, list[Runs]] = {}
-    for group in alike(runs):
-        series.setdefault(key_of(group[0], shared), []).append(group)
+    series = grouped((key_of(group[0], shared), group) for group in alike(runs))
     for groups in (sorted(found, key=order) for found in series.values() if len(found) > 1):
         psnr = [None, *(group.mean("psnr") for group in groups)]
         for group, before, now in zip(groups, psnr, psnr[1:]):
@@ -334,7 +332,7 @@ def write_methods(folder: Path, out: Path) -> list[Path]:
     ablations = [row for row in found if row["ablation"] not in (None, "base")]
     left_out += [f"{row['folder'].relative_to(folder)}: an ablation" for row in ablations]
     page, table = out / "methods.md", out / "methods.csv"
-    runs = add_to_table(table, (row for row in found if row not in ablations))
+    runs = results.add_to_table(table, (row for row in found if row not in ablations))
     earlier, scenes, written = read_text(page) if page.is_file() else "", [], [page, table]
     for scene, own in runs.by("scene").items():
         several = len(own.by("preset")) > 1
@@ -406,11 +404,11 @@ def _reached(runs: Runs, others: Runs) -> Table:
 
 def _departures(runs: Runs) -> Table:
     """List what differs from the publications, and the faults kept from released code, with their methods."""
-    found: dict[str, set[str]] = {}
+    told = []
     for field, mark in (("departures", ""), ("faults", "kept fault: ")):
         for row in runs:
-            for departure in filter(None, (row[field] or "").split("; ")):
-                found.setdefault(mark + departure, set()).add(f"`{row['method']}`")
-    lines = [[about, ", ".join(sorted(methods))] for about, methods in found.items()]
+            parts = filter(None, (row[field] or "").split("; "))
+            told += [(mark + part, f"`{row['method']}`") for part in parts]
+    lines = [[about, ", ".join(sorted(set(methods)))] for about, methods in grouped(told).items()]
     lines.sort(key=lambda line: (line[0].startswith("kept"), -line[1].count(","), line[0]))
     return Table(["departure", "methods"], lines)

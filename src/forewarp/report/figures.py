@@ -228,8 +228,9 @@ def thirds(sheet):
     return [sheet[:, i * (width + GAP) : i * (width + GAP) + width] for i in range(3)]
 
 
-def _parts(path: Path) -> list[np.ndarray]:
-    with Image.open(path) as sheet:
+def _parts(row: Row, view: str) -> list[np.ndarray]:
+    """Read truth, rendering and error of a view of a run."""
+    with Image.open(sheets_of(row["folder"])[view]) as sheet:
         return thirds(np.asarray(sheet) / 255)
 
 
@@ -263,7 +264,7 @@ def draw_beside(path: Path, runs: Mapping[str, Row], near: float, about: str) ->
     """
     if (view := view_near(runs, near)) is None:
         return None
-    parts = {name: _parts(sheets_of(row["folder"])[view]) for name, row in runs.items()}
+    parts = {name: _parts(row, view) for name, row in runs.items()}
     figure, axes = figure_of(2, 1 + len(parts), (3 * (1 + len(parts)), 6.6))
     truth = next(iter(parts.values()))[0]
     _show(axes[0], {"truth": truth} | {name: drawn for name, (_, drawn, _) in parts.items()})
@@ -281,7 +282,7 @@ def draw_sheet(path: Path, runs: Mapping[str, Row]) -> Path | None:
     figure, axes = figure_of(len(found), 3, (9, 3.2 * len(found)))
     for row, (scene, sheets) in zip(axes, found.items()):
         name = sorted(sheets)[len(sheets) // 2]
-        _show(row, dict(zip((f"{scene}, {name}", "rendered", "error"), _parts(sheets[name]))))
+        _show(row, dict(zip((f"{scene}, {name}", "rendered", "error"), _parts(runs[scene], name))))
     return save(figure, path)
 
 
@@ -327,7 +328,7 @@ def draw_views(path: Path, runs: Mapping[str, Row], times: Sequence[float] = (0.
     for view in dict.fromkeys(filter(None, (view_near(runs, time) for time in times))):
         tiles = {}
         for name, row in runs.items():
-            truth, drawn, _ = _parts(sheets_of(row["folder"])[view])
+            truth, drawn, _ = _parts(row, view)
             psnr = [image["scores"]["psnr"] for image in row["images"] if image["name"] == view]
             tiles = tiles or {f"truth, {view.rpartition('/')[2]}": truth}
             tiles[f"{name}, {psnr[0]:.1f}" if psnr else name] = drawn

@@ -56,13 +56,13 @@ class Group(NamedTuple):
 
 
 class Printed(NamedTuple):
-    """A printed row, numbers as text, "" for a missing number.
+    """A printed row: numbers by group and metric, as text, "" for a missing number.
 
     ``model`` and ``variant`` name the measured runs to compare with the row; others have no variant.
     """
 
     name: str
-    values: tuple[str, ...]
+    values: Mapping[tuple[Group, str], str]
     variant: str | None = None
     model: str | None = None
 
@@ -120,11 +120,12 @@ def _table(key: str, entry: dict, datasets: dict) -> PaperTable:
         scenes = tuple(group.get("scenes", datasets[group["dataset"]]))
         about = group["name"], group["dataset"], tuple(group["metrics"]), scenes
         groups.append(Group(*about, group.get("ability")))
-    columns = sum(len(group.metrics) for group in groups)
+    columns = [(group, metric) for group in groups for metric in group.metrics]
     for row in entry["rows"]:
-        values = tuple("" if value == "null" else value for value in row["values"])
-        if len(values) != columns:
-            raise ValueError(f"{key}: {row['name']}: expected {columns} values, but got {len(values)}")
+        values = ["" if value == "null" else value for value in row["values"]]
+        if len(values) != len(columns):
+            raise ValueError(f"{key}: {row['name']}: expected {len(columns)} values, but got {len(values)}")
+        values = dict(zip(columns, values))
         variant = row.get("variant", "full" if row["name"].split(" (")[0] == "Ours" else None)
         rows.append(Printed(row["name"], values, variant, row.get("model", "forward" if variant else None)))
     means = {name: tuple(scenes) for name, scenes in entry.get("means", {}).items()}
@@ -200,21 +201,19 @@ def comparison(table: PaperTable, runs: Runs, numbers: Mapping[str, int] | None 
     """
     found = measured(table, runs)
     datasets = {run["origin"] for of_row in found for run in of_row}
-    kept = [i for i, (group, _) in enumerate(table.columns) if group.dataset in datasets]
-    rows = [row._replace(values=tuple(row.values[i] for i in kept)) for row in table.rows]
-    groups = [group for group in table.groups if group.dataset in datasets]
-    table = replace(table, groups=groups, rows=rows)
+    table = replace(table, groups=[group for group in table.groups if group.dataset in datasets])
     numbers, no_costs = numbers or numbered(runs), [None] * len(COSTS)
     lines, rules = [], []
     for printed in [*table.rows, None]:
         of_method = [of_row for of_row in found if table.printed(of_row[0]) is printed]
         rules += [len(lines)] if of_method or (printed and lines and lines[-1][1] != "published") else []
-        lines += [[printed.name, "published", *printed.values, *no_costs]] if printed else []
+        values = [printed.values[column] for column in table.columns] if printed else []
+        lines += [[printed.name, "published", *values, *no_costs]] if printed else []
         for of_row in of_method:
             cells = cells_of(of_row, table)
             lines.append([name_of(of_row, found), "measured", *cells, *costs_of(of_row, numbers)])
             if printed and any(cells):
-                both = zip(cells, printed.values)
+                both = zip(cells, values)
                 differences = [Difference(cell.mean - float(v)) if cell and v else None for cell, v in both]
                 lines.append(["", "difference to the paper", *differences, *no_costs])
     columns = ["method", "kind", *(_column(*column) for column in table.columns), *COSTS]
@@ -232,16 +231,16 @@ def stand_in(table: PaperTable, runs: Runs, numbers: Mapping[str, int] | None = 
     if made is None or not found:
         return None
     numbers, datasets = numbers or numbered(runs), {run["origin"] for of_row in found for run in of_row}
-    scores = [(i, group) for i, (group, metric) in enumerate(table.columns) if metric == "psnr"]
-    shown = [(i, group) for i, group in scores if group.dataset in datasets and len(group.scenes) > 1]
+    scores = [group for group in table.groups if "psnr" in group.metrics and len(group.scenes) > 1]
+    shown = [group for group in scores if group.dataset in datasets]
     lines = []
     for of_row in found:
         printed, own = table.printed(of_row[0]), {run["origin"] for run in of_row}
-        values = [printed.values[i] if printed and group.dataset in own else "" for i, group in shown]
+        values = [printed.values[of, "psnr"] if printed and of.dataset in own else "" for of in shown]
         beside = [printed.name if printed else "", *values]
         lines.append([name_of(of_row, found), *cells_of(of_row, made), *costs_of(of_row, numbers), *beside])
     columns = ["measured", *(_column(*column) for column in made.columns), *COSTS, "published as"]
-    columns += [f"published: {group.name} PSNR" for _, group in shown]
+    columns += [f"published: {group.name} PSNR" for group in shown]
     return Table(columns, lines, marks=_marks(found, made, lines, 1)).filled()
 
 
@@ -271,14 +270,14 @@ def with_means(table: PaperTable, runs: Runs) -> PaperTable:
     groups, rows = list(table.groups), list(table.rows)
     for name, scenes in asked.items():
         own = [group for group in table.groups if len(group.scenes) == 1 and group.scenes[0] in scenes]
-        groups.append(own[0]._replace(name=name, scenes=scenes))
+        groups.append(of_all := own[0]._replace(name=name, scenes=scenes))
         for i, row in enumerate(rows):
-            values, means = dict(zip(table.columns, row.values)), []
-            for metric in own[0].metrics:
-                texts = [values[group, metric] for group in own]
+            means = {}
+            for metric in of_all.metrics:
+                texts = [row.values[group, metric] for group in own]
                 digits = max(len(text.partition(".")[2]) for text in texts)
-                means.append("" if "" in texts else f"{fmean(map(float, texts)):.{digits}f}")
-            rows[i] = row._replace(values=(*row.values, *means))
+                means[of_all, metric] = "" if "" in texts else f"{fmean(map(float, texts)):.{digits}f}"
+            rows[i] = row._replace(values=row.values | means)
     return replace(table, groups=groups, rows=rows)
 
 
@@ -334,15 +333,11 @@ def write_paper(folder: Path, out: Path, published: Path = PAPER, curves: Path |
     """
     paper = read_paper(published).values()
     runs, left_out = _read(folder, paper)
-    elsewhere = [
-        f"{dataset or 'no dataset'}, {len(found)} run{'s' * (len(found) > 1)}: "
-        "not in any table of the paper; use kind=compare or kind=accuracy_time"
-        for dataset, found in runs.by("origin").items()
-        if dataset not in {group.dataset for table in paper for group in table.groups}
-    ]
-    for line in elsewhere:
-        print(line)
-    left_out += elsewhere
+    for dataset, found in runs.by("origin").items():
+        if dataset not in {group.dataset for table in paper for group in table.groups}:
+            count = f"{dataset or 'no dataset'}, {len(found)} run{'s' * (len(found) > 1)}"
+            left_out.append(f"{count}: not in any table of the paper; use kind=compare or kind=accuracy_time")
+            print(left_out[-1])
     real, made = runs.where(counterpart=False), runs.where(counterpart=True)
     shown_runs = {table: [Runs(chain(*measured(table, kind))) for kind in (real, made)] for table in paper}
     used = Runs(run for kinds in shown_runs.values() for kind in kinds for run in kind)
@@ -636,8 +631,8 @@ def _printed_changes(table: PaperTable, group: Group) -> dict[str, float]:
     """Return by variant the printed difference to ``Ours``, in the widest mean of this kind of view."""
     same = [g for g in table.groups if (g.dataset, g.ability) == (group.dataset, group.ability)]
     widest = group if group in same else max(same, key=lambda g: len(g.scenes))
-    at = table.columns.index((widest, "psnr"))
-    numbers = {row.variant: float(row.values[at]) for row in table.parts if row.values[at]}
+    texts = {row.variant: row.values[widest, "psnr"] for row in table.parts}
+    numbers = {variant: float(text) for variant, text in texts.items() if text}
     whole = numbers.pop("full", None)
     return {variant: number - whole for variant, number in numbers.items()} if whole is not None else {}
 

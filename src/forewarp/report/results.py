@@ -155,14 +155,14 @@ class Runs(list[Row]):
 
         A sweep's clock and threads, which are not typed, are added. None if no command is known.
 
-        >>> row = {"command": "forewarp-train seed=1 scene=s model=a", "clock": "wall", "threads": 2}
+        >>> row = {"command": "forewarp-train seed=1 scene=s model=a run=r", "clock": "wall", "threads": 2}
         >>> Runs([row, row | {"command": "forewarp-train scene=s model=b"}]).command()
         {'shared': 'forewarp-train scene=s threads=2', 'varied': ['`model=a,b`']}
         """
         commands = []
         for row in self:
             if "#" not in (row["command"] or "#"):  # this sign begins a comment in place of a lost command
-                typed = re.sub(r"\s(seed|budget\.clock|threads)=\S+", "", row["command"])
+                typed = re.sub(r"\s(seed|budget\.clock|threads)=\S+", "", portable(row["command"]))
                 typed += f" budget.clock={row['clock']}" if row["clock"] != "wall" else ""
                 typed += f" threads={row['threads']:g}" if row["threads"] else ""
                 commands.append(overrides(typed))

@@ -438,10 +438,9 @@ def _of_views(images: Sequence[dict]) -> list[dict]:
     worst, best = f"{low['psnr']:.1f} dB", f"{high['psnr']:.1f} dB"
     ranks = f"From the worst view ({worst}) to the best ({best}), from their mean; {below} of {len(images)} "
     ranks += f"{'is' if below == 1 else 'are'} more than 1 dB below it.{fewer}"
-    return [
-        chart("Through the scene's time", dots, series, ("time in the scene", "PSNR (dB)"), mean=mean),
-        chart("View by view", ranks, [stems], ("view, from worst to best", "PSNR (dB)"), mean=mean),
-    ]
+    by_time = chart("Through the scene's time", dots, series, ("time in the scene", "PSNR (dB)"), mean=mean)
+    axes = ("view, from worst to best", "PSNR (dB)")
+    return [by_time, chart("View by view", ranks, [stems], axes, mean=mean)]
 
 
 def _accuracy(row: Row) -> list[dict]:
