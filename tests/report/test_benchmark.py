@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 from PIL import Image
 
 from forewarp.metrics.registry import METRICS, Metric
@@ -192,7 +193,8 @@ def test_methods_are_compared_over_lengths(tmp_path, monkeypatch):
     assert "accuracy-time.md" not in pages_of(write_minutes(tmp_path / "later", out))
     timed(tmp_path / "later", "forward", 5.0, 29.5)
     toy = Published("Toy", 60.0, 20.0, "a CPU", "a page", "toy")
-    written = write_minutes(tmp_path / "later", out, [OTHER, toy])
+    (tmp_path / "others.yaml").write_text(yaml.safe_dump([other._asdict() for other in (OTHER, toy)]))
+    written = write_minutes(tmp_path / "later", out, tmp_path / "others.yaml")
     text = pages_of(written)["accuracy-time.md"]
     assert rows_of(text, "method")[0][1:] == ["2 s", "1 min", "5 min", "seeds", "passed by `particles` after"]
     assert rows_of(text, "`particles`")[0][1:] == ["21.00 ± 1.41", "30.00", "33.00", "2, 1, 1", ""]

@@ -53,7 +53,9 @@ def test_a_target_of_ones_own_and_what_has_no_curve(tmp_path):
     write_run(tmp_path / "runs", "failed", curve=None)
     write_run(tmp_path / "runs", "killed", psnr=None)
     others = [Published(name, 100.0, 32.0, "a GPU", "its paper", name) for name in ("dnerf", "hypernerf")]
-    page = write_accuracy_time(tmp_path / "runs", tmp_path, target=20.0, published=others)[0].read_text()
+    (tmp_path / "others.yaml").write_text(yaml.safe_dump([other._asdict() for other in others]))
+    options = {"target": 20.0, "published": tmp_path / "others.yaml"}
+    page = write_accuracy_time(tmp_path / "runs", tmp_path, **options)[0].read_text()
     assert rows_of(page, "base")[0][1:6] == ["0.05", "1", "10.0", "25.50", "0.2500"]
     assert "* ball/failed-1.0-seed0: no accuracy_time.csv; run its command with data.held_out=8" in page
     assert "* ball/killed-1.0-seed0: no metrics.json; run its command again" in page

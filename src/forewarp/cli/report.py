@@ -37,7 +37,6 @@ make reproduce-tables [DATA=DATASETS], make ablations, make effects. Runs withou
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from contextlib import suppress
 from glob import glob
 from pathlib import Path
@@ -53,11 +52,11 @@ from forewarp.runs.config_files import project_root
 
 # Where the runs of a kind are if none are named, what writes its page, and the options that it takes.
 KINDS = {
-    "accuracy_time": ("accuracy_time", "choices.write_accuracy_time", ("target", "published_points")),
+    "accuracy_time": ("accuracy_time", "choices.write_accuracy_time", ("target", "published")),
     "price_list": ("accuracy_time", "choices.write_price_list", ()),
-    "paper": ("paper", "paper.write_paper", ("curves", "printed_tables")),
-    "ablation": ("ablations", "paper.write_ablation", ("printed_tables",)),
-    "minutes": ("minutes", "benchmark.write_minutes", ("published_points",)),
+    "paper": ("paper", "paper.write_paper", ("curves", "published")),
+    "ablation": ("ablations", "paper.write_ablation", ("published",)),
+    "minutes": ("minutes", "benchmark.write_minutes", ("published",)),
     "methods": ("paper", "benchmark.write_methods", ()),
     "effects": ("effects", "choices.write_effects", ()),
     "search": ("search", "choices.write_search", ()),
@@ -78,27 +77,13 @@ def report(config: DictConfig) -> None:
     elif not isinstance(config.runs, str | None):
         raise ValueError(f"runs: expected one folder for kind={config.kind}, but got a list; name one folder")
     else:
-        place, write, options = KINDS[config.kind]
+        place, function, names = KINDS[config.kind]
         runs = Path(config.runs or f"{config.paths.runs}/{place}")
-        out = Path(config.out or runs / "results")
-        for file in resolve_name(f"forewarp.report.{write}")(runs, out, **options_of(config, options)):
-            print(f"written: {file}")
-
-
-def options_of(config: DictConfig, names: Sequence[str]) -> dict:
-    """Return a page's options: the PSNR that seconds are listed for, a folder of curves, others' results and
-    the paper's printed numbers, where another file of them is wanted.
-    """
-    options = {"target": config.target} if "target" in names else {}
-    if "curves" in names:
-        options["curves"] = Path(config.curves or f"{config.paths.runs}/accuracy_time/results")
-    if "printed_tables" in names and config.published:
-        options["published"] = Path(config.published)
-    if "published_points" in names:
-        from forewarp.report.benchmark import OTHERS, read_published
-
-        options["published"] = read_published(Path(config.published or OTHERS))
-    return options
+        typed = {"target": config.target, "published": config.published and Path(config.published)}
+        typed["curves"] = Path(config.curves or f"{config.paths.runs}/accuracy_time/results")
+        options = {name: typed[name] for name in names}
+        out, write = Path(config.out or runs / "results"), resolve_name(f"forewarp.report.{function}")
+        print(*(f"written: {file}" for file in write(runs, out, **options)), sep="\n")
 
 
 def compared(config: DictConfig) -> str:

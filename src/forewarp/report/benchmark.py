@@ -19,8 +19,8 @@ import yaml
 from forewarp.files import MOST_CONFIG, read_rows, read_text, replace_file
 from forewarp.metrics.gain import Estimate
 from forewarp.metrics.registry import metric_of
-from forewarp.report import figures, results
-from forewarp.report.results import CONDITIONS, Runs, grouped, in_words, key_of, length, pairs
+from forewarp.report import figures
+from forewarp.report.results import CONDITIONS, Runs, add_rows, grouped, in_words, key_of, length, read_runs
 from forewarp.report.tables import Column, Table, rendered, score_columns
 
 OTHERS = Path(__file__).with_name("published.yaml")  # results of others
@@ -47,12 +47,13 @@ class Published(NamedTuple):
     dataset: str
 
 
-def read_published(path: Path) -> list[Published]:
-    """Read a YAML list of entries with the keys of ``Published``.
+def read_published(path: Path | None = None) -> list[Published]:
+    """Read a YAML list of entries with the keys of ``Published``; None: ``OTHERS``.
 
     Raises:
         ValueError: if the file is no YAML, or an entry has other keys.
     """
+    path = path or OTHERS
     try:
         return [Published(**entry) for entry in yaml.safe_load(read_text(path, MOST_CONFIG))]
     except (TypeError, yaml.YAMLError) as error:
@@ -60,41 +61,39 @@ def read_published(path: Path) -> list[Published]:
         raise ValueError(f"{path}: expected {expected}, but got {got}") from None
 
 
-def write_minutes(folder: Path, out: Path, published: Sequence[Published] = ()) -> list[Path]:
+def write_minutes(folder: Path, out: Path, published: Path | None = None) -> list[Path]:
     """Write ``<method>.md``, ``.csv`` (a row a run) and ``.png`` (PSNR by view) of each method in the runs,
-    and ``accuracy-time.md`` of them all, with the results of others that were ``published``.
+    and ``accuracy-time.md`` of them all, with the results of others in the file ``published`` (``OTHERS``).
 
     Rows of a table that is there already stay, unless a run of the same ``results.KEY`` replaces them: runs
     may be made one day after the other. Each page compares its method with the others, so that the pages of
     methods with a table in ``out`` are written anew too.
     """
+    others = read_published(published)
     runs, left_out = _timed(folder)
     methods, written = {row["method"] for row in runs}, []
     for file in out.glob("*.csv"):  # of earlier calls
         named = {row.get("method") for row in read_rows(file)}
         methods |= named if named == {file.stem} and file.with_suffix(".md").is_file() else set()
-    rows = {
-        name: results.add_to_table(out / f"{name}.csv", runs.where(method=name)) for name in sorted(methods)
-    }
+    rows = {name: add_rows(out / f"{name}.csv", runs.where(method=name)) for name in sorted(methods)}
     tables = {method: labelled(own) for method, own in rows.items()}
     for method, own in tables.items():
-        others = {other: found for other, found in tables.items() if other != method}
+        rivals = {other: found for other, found in tables.items() if other != method}
         page, picture = out / f"{method}.md", out / f"{method}.png"
-        replace_file(page, rendered("minutes.md.j2", left_out=left_out, **_of_method(method, own, others)))
+        replace_file(page, rendered("minutes.md.j2", left_out=left_out, **_of_method(method, own, rivals)))
         scenes = {}
         for group in alike(plain(own)):
-            by_time = grouped(chain(*(pairs(row["views"]) for row in group)))
             label = f"{length(group[0]['minutes'])}, {len(group)} seed{'s' * (len(group) > 1)}"
-            means = {label: [(time, fmean(by_time[time])) for time in sorted(by_time)]} if by_time else {}
-            scenes.setdefault(group[0]["label"], {}).update(means)
+            points = group.by_time()
+            scenes.setdefault(group[0]["label"], {}).update({label: points} if points else {})
         figures.draw_by_time(picture, scenes)
         written += [page, out / f"{method}.csv", picture]
-    return written + _write_lengths(tables, out, published)
+    return written + _write_lengths(tables, out, others)
 
 
 def _timed(folder: Path) -> tuple[Runs, list[str]]:
     """Read the measured runs of so many minutes, the newest of equal ones; and a line for each other run."""
-    runs, left_out = results.read_runs(folder)
+    runs, left_out = read_runs(folder)
     endless = [(row, "no budget.minutes") for row in runs.where(minutes=None)]
     runs, older = Runs(row for row in runs if row["minutes"] is not None).newest("method", "seed", *TASK)
     unused = [*endless, *((row, "another run of the same is newer") for row in older)]
@@ -332,7 +331,7 @@ def write_methods(folder: Path, out: Path) -> list[Path]:
     ablations = [row for row in found if row["ablation"] not in (None, "base")]
     left_out += [f"{row['folder'].relative_to(folder)}: an ablation" for row in ablations]
     page, table = out / "methods.md", out / "methods.csv"
-    runs = results.add_to_table(table, (row for row in found if row not in ablations))
+    runs = add_rows(table, (row for row in found if row not in ablations))
     earlier, scenes, written = read_text(page) if page.is_file() else "", [], [page, table]
     for scene, own in runs.by("scene").items():
         several = len(own.by("preset")) > 1

@@ -17,6 +17,7 @@ from statistics import mode
 from forewarp.files import read_json, replace_file
 from forewarp.metrics.gain import FACTORS, Estimate, measure_effect
 from forewarp.metrics.registry import METRICS, metric_of
+from forewarp.report.benchmark import read_published
 from forewarp.report.figures import draw_scene
 from forewarp.report.results import KINDS, PLACES, Point, Row, Runs, overrides, read_runs
 from forewarp.report.tables import Column, Difference, Table, rendered, score_columns
@@ -56,7 +57,7 @@ def _read(folder: Path, needed: Sequence[str] = ("metrics.json",)) -> tuple[Runs
 
 
 def write_accuracy_time(
-    folder: Path, out: Path, *, target: float | None = None, published: Sequence = ()
+    folder: Path, out: Path, *, target: float | None = None, published: Path | None = None
 ) -> list[Path]:
     """Write ``accuracy-time.md``, and a picture and a CSV file a scene.
 
@@ -64,15 +65,16 @@ def write_accuracy_time(
         folder, out: see above.
         target: list each variant's seconds to this PSNR (dB); None: the last whole dB that the base, or else
             the best run, reached.
-        published: results of others, drawn as stars.
+        published: file of results of others, drawn as stars; None: ours.
     """
+    others = read_published(published)
     runs, left_out = _read(folder, ["accuracy_time.csv", "metrics.json"])
     scenes, written = [], []
     for scene, found in runs.by("scene").items():
         groups = by_variant(found, "minutes")
         name = "accuracy-time-" + re.sub(r"[^\w.-]+", "-", scene).strip("-")
         picture, file = out / f"{name}.png", out / f"{name}.csv"
-        beside = [other for other in published if other.dataset == found[0]["dataset"]]
+        beside = [other for other in others if other.dataset == found[0]["dataset"]]
         draw_scene(picture, groups, scene, beside)
         curves = [row["points"] for row in found.where(variant="base") or found]
         twice = [min(a.psnr, b.psnr) for curve in curves for a, b in zip(curve, curve[1:] or curve)]
@@ -81,7 +83,7 @@ def write_accuracy_time(
         scenes.append({"name": scene, "picture": picture.name, "tables": [cheapest(groups), every]})
         written += [picture, file]
     datasets = {row["dataset"] for row in runs}
-    shown = [other for other in published if other.dataset in datasets]
+    shown = [other for other in others if other.dataset in datasets]
     about = {"machine": runs.machines(), "published": shown, "left_out": left_out}
     replace_file(out / "accuracy-time.md", rendered("accuracy_time.md.j2", scenes=scenes, **about))
     return [out / "accuracy-time.md", *written]

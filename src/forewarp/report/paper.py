@@ -321,17 +321,19 @@ def _marks(found: Sequence[Runs], table: PaperTable, lines: Sequence[Sequence[Ce
     return marks
 
 
-def write_paper(folder: Path, out: Path, published: Path = PAPER, curves: Path | None = None) -> list[Path]:
+def write_paper(
+    folder: Path, out: Path, published: Path | None = None, curves: Path | None = None
+) -> list[Path]:
     """Write ``paper.md``, ``paper.tex``, ``paper.html``, a CSV file a table, and the figures.
 
     Tables without a measured row are left out.
 
     Args:
         folder, out: see above.
-        published: file of the printed numbers.
+        published: file of the printed numbers; None: ``PAPER``.
         curves: folder of the pictures drawn by ``kind=accuracy_time``, shown too.
     """
-    paper = read_paper(published).values()
+    paper = read_paper(published or PAPER).values()
     runs, left_out = _read(folder, paper)
     for dataset, found in runs.by("origin").items():
         if dataset not in {group.dataset for table in paper for group in table.groups}:
@@ -444,7 +446,7 @@ def _figures(runs: Runs, out: Path, curves: Path | None) -> list[Section]:
     return sections
 
 
-def write_ablation(folder: Path, out: Path, published: Path = PAPER) -> list[Path]:
+def write_ablation(folder: Path, out: Path, published: Path | None = None) -> list[Path]:
     """Write ``ablation.md`` and ``ablation.csv`` (every run), of runs at rest ``ablation-at-rest.csv``.
 
     The part of a page already there that these runs do not fill, at rest or not, stays.
@@ -452,12 +454,12 @@ def write_ablation(folder: Path, out: Path, published: Path = PAPER) -> list[Pat
     Args:
         folder: of runs of ``sweeps=ablation_modules``, ``ablation_losses`` and ``ablation_at_rest``.
         out: see above.
-        published: file of the printed numbers.
+        published: file of the printed numbers; None: ``PAPER``.
 
     Raises:
         ValueError: if no run is of an ablation.
     """
-    paper = read_paper(published).values()
+    paper = read_paper(published or PAPER).values()
     runs, left_out = _read(folder, paper)
     # Tables that take the method apart; a table scene by scene repeats another.
     tables = [table for table in paper if not table.means and len(table.parts) > 1]

@@ -89,6 +89,11 @@ class Runs(list[Row]):
         kept = {id(row) for row in last.values()}
         return Runs(row for row in self if id(row) in kept), Runs(row for row in self if id(row) not in kept)
 
+    def by_time(self) -> list[tuple[float, float]]:
+        """Average the PSNR of views over the rows: (time, PSNR) of each time, in order."""
+        views = grouped(chain(*(pairs(row["views"]) for row in self)))
+        return [(time, statistics.fmean(views[time])) for time in sorted(views)]
+
     def estimate(self, name: str) -> Estimate | None:
         """Estimate a number over the rows that have it; None if none has."""
         return Estimate.of(row.get(name) for row in self)
@@ -401,7 +406,7 @@ def overrides(name: str) -> list[str]:
     return [re.sub(r"\s", "", part) for part in re.split(r"\s+(?=[+~]|[\w./]+=)", name) if part]
 
 
-def add_to_table(file: Path, rows: Iterable[Row]) -> Runs:
+def add_rows(file: Path, rows: Iterable[Row]) -> Runs:
     """Add rows to those of a CSV file, which is written; return all.
 
     Of rows with the same ``KEY`` the one measured last stays; a run beats a row of its day.
