@@ -195,7 +195,7 @@ def test_what_is_typed_beside_a_plan_wins(tmp_path):
     ]
     assert f"run={tmp_path}" in with_plan("train", [f"plan={file}", f"run={tmp_path}"])
     for word in ("model=backward", "resume=runs/x"):
-        with pytest.raises(ValueError, match=f"{word}: expected no such override beside plan="):
+        with pytest.raises(ValueError, match=f"{word}: expected none beside plan="):
             with_plan("train", [f"plan={file}", word])
     assert with_plan("train", [f"plan={file}", "model=forward"])[-1] == "model=forward"
     assert with_plan("plan", ["plan.folder=x"]) == ["plan.folder=x"]

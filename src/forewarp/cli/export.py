@@ -119,15 +119,14 @@ def check(config, windows: int = 1) -> list[float]:
     """
     from omegaconf import ListConfig
 
-    from forewarp.data.files import one_of
+    from forewarp.data.files import mismatch, one_of
     from forewarp.export.formats import FORMATS, check_option, require
     from forewarp.runs.overrides import key_of, typed_overrides
 
     one_of(config.format, "format", *FORMATS)
     form, name = FORMATS[config.format], f"format={config.format}"
     if windows > 1 and form.times:
-        expected = "format: expected glb or html for a film's windows"
-        raise ValueError(f"{expected}, but got {config.format}; export one of them")
+        raise mismatch("format", "glb or html for a film's windows", config.format, "export one of them")
     foreign = {option for other in FORMATS.values() for option in other.options} - set(form.options)
     for key in map(key_of, typed_overrides()):
         if key == "times" and not form.times:

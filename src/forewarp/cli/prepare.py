@@ -17,7 +17,7 @@ from omegaconf import DictConfig
 
 from forewarp.cli.mistakes import of_another
 from forewarp.cli.view import require_viewer
-from forewarp.data.files import number, one_of, scene_folder, whole
+from forewarp.data.files import mismatch, number, one_of, scene_folder, whole
 from forewarp.files import MOST_CONFIG, read_text, replace_file
 from forewarp.runs.config import check_planned, check_values, hashed, is_swept, resumed, trust_of
 from forewarp.runs.overrides import key_of, typed_overrides
@@ -135,8 +135,8 @@ def refuse_all(config: DictConfig) -> None:
     refuse_seeds(config)
     model, ablation = config.model.name, config.get("variant") or {}
     if model not in ablation.get("of", [model]):
-        expected = f"model: expected {' or '.join(ablation.of)}, which {ablation.name} is a change of"
-        raise ValueError(f"{expected}, but got {model}; leave one of them out")
+        expected = f"{' or '.join(ablation.of)}, which {ablation.name} is a change of"
+        raise mismatch("model", expected, model, "leave one of them out")
     if config.preset.get("name") == "compact" and model not in ("forward", "backward"):
         expected = "expected demo, fast or faithful, as compact is of model=forward and model=backward"
         raise ValueError(f"preset: {expected}, but got compact beside model={model}")
@@ -165,8 +165,7 @@ def refuse_missing_start(config: DictConfig) -> None:
         raise ValueError(f"start: expected model=particles beside it, but got model={config.model.name}")
     if not any(Path(config.run).glob("*/last.ckpt")) and not any(Path(start).glob("*/done.json")):
         advice = "make it by the same command with windows=still, without data.window and start"
-        expected = "start: expected a finished run of what stands still"
-        raise ValueError(f"{expected}, but got none in {start}; {advice}")
+        raise mismatch("start", "a finished run of what stands still", f"none in {start}", advice)
 
 
 def refuse_seeds(config: DictConfig) -> None:
@@ -179,9 +178,8 @@ def refuse_seeds(config: DictConfig) -> None:
         if config.get("seeds", 1) != 1:
             raise ValueError(f"seeds: expected 1 in a search, but got {config.seeds}; use seed=N")
         if seeds.startswith("range"):
-            expected = "expected one seed, as this sweeper would search among several"
-            advice = "add hydra.sweeper.params.seed=0"
-            raise ValueError(f"hydra.sweeper.params.seed: {expected}, but got {seeds}; {advice}")
+            key, wanted = "hydra.sweeper.params.seed", "one seed, as this sweeper would search among several"
+            raise mismatch(key, wanted, seeds, f"add {key}=0")
 
 
 def refuse_other_methods(config: DictConfig) -> None:

@@ -82,8 +82,7 @@ def with_plan(name: str, arguments: list[str]) -> list[str]:
     for override in typed:
         other_model = override.startswith("model=") and override not in planned
         if override.startswith("resume=") or other_model:
-            told = f"expected no such override beside plan={files[-1]}"
-            raise ValueError(f"{override}: {told}; leave one of them out")
+            raise ValueError(f"{override}: expected none beside plan={files[-1]}; leave one of them out")
     file = files[-1].replace("\\", "\\\\").replace("'", "\\'")
     kept = [*planned, f"planned='{file}'", "effects=given"]
     return without_switched_off(merged([*kept, *own_folder(typed)], typed))

@@ -15,7 +15,7 @@ from lightning.pytorch.profilers import AdvancedProfiler, SimpleProfiler
 from omegaconf import DictConfig, OmegaConf
 
 from forewarp.clock import Clock
-from forewarp.data.files import one_of, whole
+from forewarp.data.files import mismatch, one_of, whole
 from forewarp.data.films import FOLDER
 from forewarp.runs.config import IDENTITY, instead_of, plain, saved_config, trust_of
 from forewarp.runs.overrides import TEXTS, key_of
@@ -126,8 +126,8 @@ def loggers_of(config: DictConfig) -> RunLoggers:
     """
     named = config.get("logger") or {}
     if "_target_" in named or not all(OmegaConf.is_dict(node) for node in named.values()):
-        expected = "logger: expected loggers by name, as logger: {csv: {_target_: ...}}"
-        raise ValueError(f"{expected}, but got one without; write its keys below a name")
+        expected = "loggers by name, as logger: {csv: {_target_: ...}}"
+        raise mismatch("logger", expected, "one without", "write its keys below a name")
     makers = instantiate(named, _convert_="all")
     runs = OmegaConf.select(config, "paths.runs") or Path(config.run).parent
     return RunLoggers(makers, Path(config.run), Path(runs), partial(hyperparameters, config))
@@ -164,8 +164,8 @@ def model_of(config: DictConfig) -> Callable:
     content.pop("name", None)
     model = instantiate(OmegaConf.create({"model": content}).model, _convert_="all")  # errors name the key
     if not callable(model):
-        expected = "model: expected a method that waits for its start"
-        raise ValueError(f"{expected}, but got {type(model).__name__}; add _partial_: true")
+        got = type(model).__name__
+        raise mismatch("model", "a method that waits for its start", got, "add _partial_: true")
     return model
 
 
@@ -197,10 +197,9 @@ def check_trainer(trainer: DictConfig) -> None:
     devices, nodes = trainer.get("devices", 1), str(trainer.get("num_nodes", 1))
     count = len(devices) if OmegaConf.is_list(devices) or isinstance(devices, list | tuple) else devices
     if (str(count), nodes) != ("1", "1"):
-        expected = "trainer.devices: expected 1, or the number of one GPU as [0]"
         got = f"{devices}" if nodes == "1" else f"{devices} on {nodes} nodes"
         advice = "one process trains a run, --multirun launcher=joblib trains several at once"
-        raise ValueError(f"{expected}, but got {got}; {advice}")
+        raise mismatch("trainer.devices", "1, or the number of one GPU as [0]", got, advice)
 
 
 def device_for(config: DictConfig) -> torch.device:
@@ -213,8 +212,7 @@ def device_for(config: DictConfig) -> torch.device:
     """
     accelerator = config.trainer.accelerator
     if accelerator not in ("auto", "cpu", "gpu", "cuda"):
-        expected = "trainer.accelerator: expected auto, cpu, gpu or cuda"
-        raise ValueError(f"{expected}, but got {accelerator}; {instead_of(accelerator)}")
+        raise mismatch("trainer.accelerator", "auto, cpu, gpu or cuda", accelerator, instead_of(accelerator))
     if accelerator in ("gpu", "cuda") and not torch.cuda.is_available():
         raise ValueError("trainer.accelerator: expected a GPU, but found none; use trainer=cpu")
     if accelerator == "auto":

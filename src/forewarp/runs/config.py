@@ -23,7 +23,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from forewarp.data.files import RECORD, number, one_of
+from forewarp.data.files import RECORD, mismatch, number, one_of
 from forewarp.files import MOST_CONFIG, read_text, refuse_links
 from forewarp.runs.overrides import constant, key_of, typed_overrides
 
@@ -164,8 +164,7 @@ def saved_config(
         raise ValueError("run: expected the folder of a run, but got nothing; set run=runs/...")
     path = Path(run) / "config.yaml"
     if not path.is_file():
-        expected = f"{path}: expected the configuration of a run"
-        raise ValueError(f"{expected}, but got none; set {key}=<a run's folder>")
+        raise mismatch(path, "the configuration of a run", "none", f"set {key}=<a run's folder>")
     saved = read_config(path, trust_of(changes.get("trust")), unused)
     for name in ("trainer", "threads", "lpips_weights", "sheets"):
         if changes.get(name) is not None:
@@ -457,10 +456,8 @@ def _check_logger(node: dict, where: Path, key: str) -> None:
         got, advice = f"{node['tracking_uri']!r:.80}", "set MLFLOW_TRACKING_URI, or add logger=mlflow"
         raise ValueError(f"{where}: {key}.tracking_uri: expected null, but got {got}; {advice}")
     if others := sorted(node.keys() - _PARTS - _PLAIN - _RESERVED - {"tracking_uri"}):
-        known = ", ".join(sorted(_PARTS | _PLAIN))
-        expected = f"{where}: {key}.{others[0]}: expected one of {known}"
-        raise ValueError(f"{expected}, but got another option; delete it")
+        known = f"one of {', '.join(sorted(_PARTS | _PLAIN))}"
+        raise mismatch(f"{where}: {key}.{others[0]}", known, "another option", "delete it")
     for name in sorted(_PARTS & node.keys()):
         if not re.fullmatch(r"(\w[\w.-]*)?", str(node[name])):
-            got = f"{node[name]!r:.80}"
-            raise ValueError(f"{where}: {key}.{name}: expected the name of a folder, but got {got}")
+            raise mismatch(f"{where}: {key}.{name}", "the name of a folder", f"{node[name]!r:.80}")

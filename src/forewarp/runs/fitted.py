@@ -18,7 +18,7 @@ from torch import Tensor
 
 from forewarp.data.batches import COLORS, color_of
 from forewarp.data.checks import blind_frames, bounds
-from forewarp.data.files import one_of
+from forewarp.data.files import mismatch, one_of
 from forewarp.evaluation.evaluate import evaluate, mean_scores, show
 from forewarp.fields.moving import MovingGaussians
 from forewarp.fields.windows import MovingWindows
@@ -401,12 +401,11 @@ def named(score: object) -> str | None:
     if score is None:
         return None
     if score not in METRICS:
-        known = ", ".join(METRICS)
-        raise ValueError(f"score: expected a metric of validation views ({known}) or null, but got {score!r}")
+        known = f"a metric of validation views ({', '.join(METRICS)}) or null"
+        raise mismatch("score", known, f"{score!r}")
     if not METRICS[score].higher_is_better and "maximize" in str(_sweeper().get("direction")).lower():
-        expected = f"minimize for {score}, which is less where it is better"
-        advice = "but got maximize; add hydra.sweeper.direction=minimize"
-        raise ValueError(f"hydra.sweeper.direction: expected {expected}, {advice}")
+        key, expected = "hydra.sweeper.direction", f"minimize for {score}, which is less where it is better"
+        raise mismatch(key, expected, "maximize", f"add {key}=minimize")
     return str(score)
 
 

@@ -14,7 +14,7 @@ from filelock import FileLock, Timeout
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
-from forewarp.data.files import LOCK, difference, one_of
+from forewarp.data.files import LOCK, difference, mismatch, one_of
 from forewarp.files import read_json, read_text, refuse_links, replace_file, write_json
 from forewarp.runs.config import IDENTITY, NOT_OF_RUN, make_absolute, read_config
 from forewarp.runs.overrides import command_line, typed_folders, typed_overrides
@@ -74,9 +74,8 @@ def locked(folder: Path) -> Iterator[None]:
         process = ""
         with suppress(OSError, ValueError):
             process = read_text(holder, 1000)[:200].strip()
-        expected = f"{folder}: expected a run that nobody works on"
-        got = f"one of {process or 'another process'}; wait for it, or use run=..."
-        raise ValueError(f"{expected}, but got {got}") from None
+        got, advice = f"one of {process or 'another process'}", "wait for it, or use run=..."
+        raise mismatch(folder, "a run that nobody works on", got, advice) from None
     except OSError as error:
         lock.release()
         raise OSError(error.errno, error.strerror, f"run: {error.filename or folder}") from None
@@ -110,8 +109,7 @@ def claim(config: DictConfig, *, finished: bool = False) -> None:
     resolved = OmegaConf.create(OmegaConf.to_container(config, resolve=True, throw_on_missing=True))
     if any(path.parent.glob("*/last.ckpt")):
         if not path.is_file():
-            expected = f"{path}: expected the configuration of the run"
-            raise ValueError(f"{expected}, but got none; use run=... or delete the folder")
+            raise mismatch(path, "the configuration of the run", "none", "use run=... or delete the folder")
         _refuse_another(path, read_config(path, None), resolved)
     if not finished:
         replace_file(path, OmegaConf.to_yaml(resolved))

@@ -6,6 +6,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from statistics import fmean
 
+from forewarp.data.files import mismatch
 from forewarp.files import read_json
 from forewarp.runs.overrides import is_sweep, key_of, text_override
 
@@ -34,15 +35,13 @@ def commands_of(arguments: Sequence[str]) -> list[list[str]]:
     if value in ("still", "each", "null"):
         return [list(arguments)]
     if not value.isdecimal() or not 2 <= int(value) <= _MOST:
-        expected = f"windows: expected a whole number from 2 to {_MOST}, still or each"
-        raise ValueError(f"{expected}, but got {value}")
+        raise mismatch("windows", f"a whole number from 2 to {_MOST}, still or each", value)
     if "data.window" in typed:
         raise ValueError(f"data.window: expected none beside windows={value}; leave it out, or windows=each")
     others = [one for one in arguments if key_of(one) not in ("windows", "run", "-m", "--multirun")]
     for one in arguments:
         if key_of(one) != "seed" and not one.startswith("-") and is_sweep(one):
-            expected = f"{key_of(one)}: expected one value beside windows={value}"
-            raise ValueError(f"{expected}, but got several; choose one")
+            raise mismatch(key_of(one), f"one value beside windows={value}", "several", "choose one")
     is_shown = any(one.partition("=")[0] in _SHOWS for one in others)  # the config, of the first window
     ends = [f"{number / int(value):.6g}" for number in range(int(value) + 1)]
     limits = [f"[{begin},{end}]" for begin, end in zip(ends, ends[1:])]  # as Hydra takes a choice of several
@@ -93,6 +92,5 @@ def check_film(windows: Sequence[tuple[float, float]], folder: Path) -> None:
     follow = all(abs(begin - end) < _SEAM for (begin, _), end in zip(windows, ends))
     if not windows or not follow or abs(ends[-1] - 1) > _SEAM:
         got = ", ".join(f"[{begin:g}, {end:g}]" for begin, end in windows) or "none"
-        expected = f"{folder}: expected a run, or windows that follow one another from 0 to 1"
         advice = "train those that are missing (windows=N), move others elsewhere"
-        raise ValueError(f"{expected}, but got {got}; {advice}")
+        raise mismatch(folder, "a run, or windows that follow one another from 0 to 1", got, advice)
