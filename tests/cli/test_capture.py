@@ -55,7 +55,7 @@ FILM = "video=a.mp4"
         (["videos=empty", "out=empty/new"], "out: expected a folder apart from .*new with videos=empty"),
         ([FILM, "without=[a]"], "without: expected videos=FOLDER beside it, but got video=; remove it"),
         (["videos=empty", "without=a"], r"without: expected a list .* but got a; write without=\[a\]"),
-        (["videos=empty", "fixed=x"], "fixed: expected true, false or null, but got x"),
+        (["videos=empty", "fixed=x"], "fixed: expected true, false or null, but got 'x'"),
         (["videos=empty", "rate=0"], "rate: expected pictures a second, above 0, but got 0"),
         (["video=none.mp4"], "video: expected an existing file, but got none: none.mp4"),
         (["video=empty"], "video: expected an existing file, but got another thing: empty"),

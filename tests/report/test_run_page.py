@@ -389,7 +389,7 @@ def test_a_run_keeps_its_trainer_unless_one_is_named(ok, run, tmp_path, monkeypa
         (["run=nowhere"], "nowhere/config.yaml: expected the configuration of a run, but got none"),
         (["run=several"], "but got several, which holds 2; choose one: several/ball/base-1.0-seed0, "),
         (["run=a", "megabytes=0.1"], "megabytes: expected a number in [0.3, 1000], but got 0.1"),
-        (["run=a", "render=some"], "render: expected true or false, but got some"),
+        (["run=a", "render=some"], "render: expected true or false, but got 'some'"),
         (["run=a", "path=spiral"], "path: expected both, trajectories, swing, fixed, orbit or null"),
     ],
 )

@@ -46,7 +46,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from forewarp.cli.entry import console_script
 from forewarp.cli.mistakes import one_line
-from forewarp.cli.render import check, write_film
+from forewarp.cli.render import write_film
 from forewarp.data.files import number, one_of
 from forewarp.runs.config_files import project_root
 
@@ -181,7 +181,6 @@ def _render(config: DictConfig, row: dict, media) -> None:
         return
     film = OmegaConf.load(project_root() / "conf" / "render.yaml")
     film.path = config.path or ("both" if row["config"].get("capture") == "cut_out" else "swing")
-    check(film)
     media.video, media.about = write_film(film, run, module), FILMS[film.path]
 
 
