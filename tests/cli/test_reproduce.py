@@ -98,8 +98,8 @@ def test_small_runs_are_kept_apart():
         ("ablations PRESET=compact MINUTES=1", "expected none beside preset=compact"),
         ("ablations DATA=there", "forewarp-reproduce tables data=there sweeps=ablations"),
         ("price-list", "data: expected data=<folder"),
-        ("price-list DATA=there MODEL=nerf", "model: expected particles or forward, but got nerf"),
-        ("effects MODEL=nerf", "model: expected particles or forward, but got nerf"),
+        ("price-list DATA=there MODEL=nerf", "model: expected particles or forward, but got 'nerf'"),
+        ("effects MODEL=nerf", "model: expected particles or forward, but got 'nerf'"),
     ],
 )
 def test_words_that_would_have_no_effect_are_refused(line, expected):
