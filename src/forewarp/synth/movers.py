@@ -182,10 +182,9 @@ def filmed(
 
     def jobs():
         for view, of_view in zip(views, times):
-            touched = Touched(view, seconds)
             yield seconds, None, view, samples, None
-            for time in of_view:
-                yield seconds, time, view, samples, touched(time)
+            for time, pixels in zip(of_view, touched(view, of_view, seconds)):
+                yield seconds, time, view, samples, pixels
 
     pixels = sum(v.width * v.height * (1 + _TOUCHED * len(of_view)) for v, of_view in zip(views, times))
     return by_processes(_shade, jobs(), pixels * samples, workers)
@@ -203,31 +202,27 @@ def _shade(seconds: float, time: float | None, view: Camera, samples: int, pixel
     return pixels, rgb, moving
 
 
-class Touched:
-    """Find the pixels of a fixed camera that movers or their shadows can touch: a few more than do."""
-
-    def __init__(self, camera: Camera, seconds: float) -> None:
-        self.camera, self.world = camera, hall(seconds)
-        origins, directions = camera_rays(camera)
-        hits = Posed(hall(seconds, has_movers=False), 0.0).first_hits(origins, directions)
-        points = np.full(origins.shape, np.inf, np.float32)
-        points[hits.ray] = origins[hits.ray] + hits.distance[:, None] * directions[hits.ray]
-        self.points, self.to_light = points, LIGHT_AT.astype(np.float32) - points
-        self.length = np.linalg.norm(self.to_light, axis=-1)
-
-    def __call__(self, time: float) -> np.ndarray:
-        """Return the numbers (n,) of the pixels at a time."""
-        touched = near_movers(self.world, [time], [self.camera]).ravel()
-        for vertices in placed_movers(self.world, time).values():
+def touched(camera: Camera, times: Iterable[float], seconds: float) -> Iterator[np.ndarray]:
+    """Yield of each time the numbers (n,) of the pixels of a fixed camera that movers or their shadows can
+    touch: a few more than do.
+    """
+    world, (origins, directions) = hall(seconds), camera_rays(camera)
+    hits = Posed(hall(seconds, has_movers=False), 0.0).first_hits(origins, directions)
+    points = np.full(origins.shape, np.inf, np.float32)
+    points[hits.ray] = origins[hits.ray] + hits.distance[:, None] * directions[hits.ray]
+    to_light = LIGHT_AT.astype(np.float32) - points
+    length = np.linalg.norm(to_light, axis=-1)
+    for time in times:
+        is_touched = near_movers(world, [time], [camera]).ravel()
+        for vertices in placed_movers(world, time).values():
             center = 0.5 * (vertices.min(0) + vertices.max(0))
             radius = np.linalg.norm(vertices - center, axis=-1).max() + 0.02
             # A cone from a point to the light's disc meets the sphere around the mover.
-            away = center.astype(np.float32) - self.points
-            along = np.einsum("nd,nd->n", away, self.to_light) / self.length
+            away = center.astype(np.float32) - points
+            along = np.einsum("nd,nd->n", away, to_light) / length
             aside = np.sqrt(np.maximum(np.einsum("nd,nd->n", away, away) - along**2, 0))
-            share = along / self.length
-            touched |= (along > -radius) & (aside < radius + LIGHT_RADIUS * share.clip(0, 1))
-        return np.flatnonzero(touched)
+            is_touched |= (along > -radius) & (aside < radius + LIGHT_RADIUS * (along / length).clip(0, 1))
+        yield np.flatnonzero(is_touched)
 
 
 def still_points(world: World, cameras: Sequence[Camera], rng: np.random.Generator, count: int) -> np.ndarray:
