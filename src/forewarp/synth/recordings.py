@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from forewarp.data import hypernerf, posed_video
-from forewarp.data.files import mismatch, remove, whole
+from forewarp.data.files import one_of, remove
 from forewarp.data.hypernerf import RigShot
 from forewarp.data.multicam import write_poses
 from forewarp.data.posed_video import PosedShot
@@ -23,7 +23,7 @@ from forewarp.scene.camera import Camera, look_at
 from forewarp.scene.frame import middle_of
 from forewarp.synth import movers
 from forewarp.synth.raycast import Posed, by_processes, camera_rays, counted, render, surface_points
-from forewarp.synth.scenes import UP, check_numbers
+from forewarp.synth.scenes import UP, check_all
 from forewarp.synth.walks import Walk, cameras_of, direction, pinhole
 from forewarp.synth.world import World
 
@@ -89,10 +89,8 @@ def synthesize_multicam(
     about a twentieth.
     """
     folder = Path(folder)
-    check_numbers(samples_per_pixel, workers, cameras=(cameras, 2), frames=(frames, 2), seed=(seed, 0))
-    whole(size, "size", 16, multiple=2)
-    if not isinstance(synchronised, bool):
-        raise mismatch("synchronised", "true or false", repr(synchronised), "set synchronised")
+    check_all(samples_per_pixel, workers, seed, cameras=(cameras, 2), frames=(frames, 2), size=(size, 16, 2))
+    one_of(synchronised, "synchronised", True, False, advice="set synchronised")
     views = rig(cameras, size, seed)
     clocks = _clocks(cameras, frames, synchronised, seed)
     ends = [clock.times[-1] for clock in clocks]
@@ -210,9 +208,8 @@ def synthesize_iphone(
 
     **Cost** every training image in whole; then for each of them a ray to every co-visible candidate.
     """
-    folder, numbers = Path(folder), {"frames": (frames, 2), "beside": (beside, 1), "seed": (seed, 0)}
-    check_numbers(samples_per_pixel, workers, **numbers)
-    whole(size, "size", 12, multiple=6)
+    folder = Path(folder)
+    check_all(samples_per_pixel, workers, seed, frames=(frames, 2), beside=(beside, 1), size=(size, 12, 6))
     seconds, times = (frames - 1) / FPS, np.linspace(0, 1, frames).tolist()
     world, shape = movers.hall(seconds), (size, size * 4 // 3)
     cameras = cameras_of(WALK, times, seconds, shape, seed)

@@ -104,8 +104,7 @@ def synthesize(
 
     **Cost** about size^2 * samples_per_pixel * 7 rays an image, at one to two million a second on one core.
     """
-    numbers = {"size": (size, 8), "frames": (frames, 2), "seed": (seed, 0), "val_views": (val_views, 0)}
-    check_numbers(samples_per_pixel, workers, **numbers)
+    check_all(samples_per_pixel, workers, seed, size=(size, 8), frames=(frames, 2), val_views=(val_views, 0))
     check_motion(motion, SUBJECTS)
     check_views(test_views, "space, time, canonical")
     times = np.linspace(0, 1, 2 * frames - 1)
@@ -158,8 +157,7 @@ def synthesize_lego_complete(
     if len(set(motions)) < len(motions):
         raise mismatch("motions", "each once", list(motions), "set motions")
     check_views(test_views, "views a training time, steps between training times, canonical views")
-    numbers = {"size": (size, 8), "frames": (frames, 2), "seed": (seed, 0), "val_views": (val_views, 0)}
-    check_numbers(samples_per_pixel, workers, **numbers)
+    check_all(samples_per_pixel, workers, seed, size=(size, 8), frames=(frames, 2), val_views=(val_views, 0))
     steps = max(test_views[1], 1)
     times = np.linspace(0, 1, steps * (frames - 1) + 1)
     train, between = times[::steps], times if test_views[1] else times[:0]
@@ -285,27 +283,21 @@ def synthesize_hypernerf(
     Raises:
         SceneError: for a bad argument; ImportError: without ``forewarp[synth]``.
     """
-    whole(size, "size", 16, multiple=8)
-    check_numbers(samples_per_pixel, workers, frames=(frames, 3), seed=(seed, 0))
+    check_all(samples_per_pixel, workers, seed, size=(size, 16, 8), frames=(frames, 3))
     if frames % 2 == 0:
         raise mismatch("frames", "an odd number, one in the middle", frames, "set frames")
     check_motion(motion)
     world, times = World(motion, has_room=True), np.linspace(0, 1, frames)
     pairs = rig_cameras(size, times, seed)
     cameras = [camera for pair in pairs for camera in pair]
-    near, far = _seen_range(world, pairs)
+    near, far = (distance * WORLD_SCALE * SCENE_SCALE for distance in _seen_range(world, pairs))
+    space = {"center": SCENE_CENTER, "scale": SCENE_SCALE, "near": near, "far": far}
+    points = _still_points(world, pairs[frames // 2], np.random.default_rng([seed, _CLOUDS]))
+    truth = _truth(world, times, cameras, np.random.default_rng([seed, _TRACKS]))
     views = [(world, float(times[i // 2]), camera) for i, camera in enumerate(cameras)]
     with closing(render_all(views, samples_per_pixel, workers, progress)) as images:
-        hypernerf.write_scene(
-            folder,
-            _rig_shots(images, cameras),
-            center=SCENE_CENTER,
-            scale=SCENE_SCALE,
-            near=near * WORLD_SCALE * SCENE_SCALE,
-            far=far * WORLD_SCALE * SCENE_SCALE,
-            points=_still_points(world, pairs[frames // 2], np.random.default_rng([seed, _CLOUDS])),
-            trajectories=_truth(world, times, cameras, np.random.default_rng([seed, _TRACKS])),
-        )
+        shots = _rig_shots(images, cameras)
+        hypernerf.write_scene(folder, shots, **space, points=points, trajectories=truth)
     return Path(folder)
 
 
@@ -408,8 +400,7 @@ def synthesize_nhr(
     Raises:
         SceneError: for a bad argument; ImportError: without ``forewarp[synth]``.
     """
-    whole(size, "size", 24, multiple=24)
-    check_numbers(samples_per_pixel, workers, frames=(frames, 2), seed=(seed, 0), points=(points, 1))
+    check_all(samples_per_pixel, workers, seed, size=(size, 24, 24), frames=(frames, 2), points=(points, 1))
     check_motion(motion)
     world, times, cameras = World(motion), np.linspace(0, 1, frames), dome_cameras(size, seed)
     drawn = surface_points(world, POINTS, cameras, np.random.default_rng([seed, _TRACKS]))
@@ -459,12 +450,12 @@ def _in_studio(rgba: np.ndarray) -> np.ndarray:
     return np.rint(alpha * rgba[..., :3] + (1 - alpha) * 255 * np.array(STUDIO)).astype(np.uint8)
 
 
-def check_numbers(samples_per_pixel: int, workers: int | None, **numbers: tuple[int, int]) -> None:
-    """Check what all scenes have, and whole numbers given as (value, least) by name."""
-    whole(samples_per_pixel, "samples_per_pixel", 1)
-    whole(1 if workers is None else workers, "workers", 1)
-    for name, (value, least) in numbers.items():
-        whole(value, name, least)
+def check_all(samples_per_pixel: int, workers: int | None, seed: int, **numbers: tuple[int, ...]) -> None:
+    """Check what all scenes have, and whole numbers by name: value, least and, perhaps, a divisor."""
+    always = {"samples_per_pixel": (samples_per_pixel, 1), "seed": (seed, 0)}
+    always["workers"] = 1 if workers is None else workers, 1
+    for name, (value, *bounds) in (always | numbers).items():
+        whole(value, name, *bounds)
 
 
 def check_motion(motion: str, among: Collection[str] = MOTIONS, name: str = "motion") -> None:
