@@ -21,7 +21,7 @@ import torch
 
 from forewarp.capture.frames import Step, write_smaller
 from forewarp.data.directions import opposite
-from forewarp.data.files import mismatch, number
+from forewarp.data.files import Entry, mismatch
 from forewarp.data.images import by, read_image
 from forewarp.data.posed_video import PosedShot, write_scene
 from forewarp.files import folder_written_whole, write_json
@@ -29,7 +29,7 @@ from forewarp.ops.gaussians import rotations
 from forewarp.scene.camera import Camera
 from forewarp.scene.frame import spread
 
-_MOST_SIDE, _MOST_UNITS, _MOST_BYTES = 1e5, 1e6, 200_000_000
+_MOST_SIDE, _UNITS, _MOST_BYTES = 1e5, (-1e6, 1e6), 200_000_000
 _MOST_DEPTH_SIDE = 2048  # pixels; LiDARs have 256 x 192, cameras of the face 640 x 480
 _OVERHEAD = 4096  # bytes, at most, that compressed data are larger by: LZFSE stores blocks that do not shrink
 _SAMPLED, _SMALLER = 16, 2  # depths that tell near and far; how many times smaller the copies are
@@ -104,22 +104,21 @@ class _Scan:
             raise mismatch(f"{path}: metadata", "JSON", str(error)) from error
         if not isinstance(about, dict):
             raise mismatch(f"{path}: metadata", "an object", short(about))
-        self.about = about
-        sides = [int(self._number(key, about.get(key), 1, _MOST_SIDE)) for key in ("w", "h")]
-        sides += [int(self._number(key, about.get(key), 1, _MOST_DEPTH_SIDE)) for key in ("dw", "dh")]
-        self.size, self.of_depth = tuple(sides[:2]), tuple(sides[2:])
+        self.about = Entry(path, about, "metadata: ")
+        width, height = (int(self.about.number(key, 1, _MOST_SIDE)) for key in ("w", "h"))
+        self.size = width, height
+        width, height = (int(self.about.number(key, 1, _MOST_DEPTH_SIDE)) for key in ("dw", "dh"))
+        self.of_depth = width, height
         self.poses = self._rows("poses", 7)
-        if not self.poses:
-            raise mismatch(f"{path}: metadata: poses", "a pose of each frame", "none")
-        matrix = self._rows("K", 1, 9)
-        self.intrinsics = [[matrix[k][0] for k in (0, 4, 6, 7)]] * len(self.poses)
+        count, matrix = len(self.poses), self.about.numbers("K", 9, *_UNITS)
+        self.intrinsics = [[matrix[k] for k in (0, 4, 6, 7)]] * count
         if about.get("perFrameIntrinsicCoeffs"):
-            self.intrinsics = self._rows("perFrameIntrinsicCoeffs", 4, len(self.poses))
+            self.intrinsics = self._rows("perFrameIntrinsicCoeffs", 4, count)
         if about.get("frameTimestamps"):
-            self.times = [row[0] for row in self._rows("frameTimestamps", 1, len(self.poses))]
+            self.times = self.about.numbers("frameTimestamps", count, *_UNITS)
         else:
-            fps = self._number("fps", about.get("fps"), 1e-3, _MOST_SIDE)
-            self.times = [i / fps for i in range(len(self.poses))]
+            fps = self.about.number("fps", 1e-3, _MOST_SIDE)
+            self.times = [i / fps for i in range(count)]
 
     def camera(self, i: int) -> Camera:
         """Return the camera of a frame; its near and far are not known."""
@@ -171,13 +170,9 @@ class _Scan:
         return np.frombuffer(raw, kind).reshape(height, width)
 
     def _rows(self, key: str, columns: int, count: int | None = None) -> list[list[float]]:
-        rows, where = self.about.get(key), f"{self.path}: metadata: {key}"
-        if not isinstance(rows, list) or (count is not None and len(rows) != count):
-            raise mismatch(where, "a list" if count is None else f"a list of {count}", short(rows))
-        rows = [row if isinstance(row, list) else [row] for row in rows]
-        if wrong := [row for row in rows if len(row) != columns]:
-            raise mismatch(where, f"{columns} numbers in each row", short(wrong[0]))
-        return [[self._number(key, value) for value in row] for row in rows]
-
-    def _number(self, key: str, value: object, low: float = -_MOST_UNITS, high: float = _MOST_UNITS) -> float:
-        return number(value, f"{self.path}: metadata: {key}", low, high)
+        rows = self.about.get(key)
+        if not isinstance(rows, list) or len(rows) != (count or max(1, len(rows))):
+            expected = f"{count or 'some'} rows of {columns} numbers"
+            raise mismatch(self.about.where(key), expected, short(rows))
+        each = Entry(self.path, {f"[{i}]": row for i, row in enumerate(rows)}, f"metadata: {key}")
+        return [each.numbers(place, columns, *_UNITS) for place in each.own]
