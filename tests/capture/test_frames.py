@@ -70,7 +70,7 @@ def test_frames_of_an_interlaced_film_are_whole(tmp_path):
 
 
 def test_frames_are_made_smaller_never_larger_by_as_many_threads_as_given(tmp_path, monkeypatch):
-    film = write_film(tmp_path / "a.mp4", numbered(2))
+    film = write_film(tmp_path / "a.mp4", numbered(3))
     calls, popen = [], subprocess.Popen
     monkeypatch.setattr(subprocess, "Popen", lambda call, **rest: calls.append(call) or popen(call, **rest))
     for size, shape in ((None, (48, 64, 3)), (32, (24, 32, 3)), (500, (48, 64, 3))):
@@ -125,7 +125,7 @@ def with_sound(path, seconds):
         (lambda p: p.write_text("no video") and p, "a video, but got another file"),
         (lambda p: p.touch() or p, "a video, but got another file"),
         (lambda p: tone(p, 1), "a video, but got sound alone"),
-        (lambda p: write_film(p, numbered(1)), "a video of many frames, but got one frame"),
+        (lambda p: write_film(p, numbered(2)), "a video of many frames, but got 2; film longer"),
         (lambda p: cut(noise(p, 9), 0.5), "a video, but got one that was cut off"),
         (lambda p: cut(noise(p, options=FAST), 0.5), "2.0 seconds, as its header says, but"),
         (lambda p: cut(with_sound(noise(p), 3), 0.5), "3.0 seconds, as its header"),

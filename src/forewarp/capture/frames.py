@@ -151,8 +151,6 @@ def _from_video(
     video = source.video
     with step("looking at frames") as progress:
         stamps, sharpnesses, widths, speeds, are_new, brightest = measure(video, progress, threads)
-    if len(stamps) < _MIN_IMAGES:
-        raise mismatch(video, "a video of many frames", f"{len(stamps)} frames", "film longer")
     kept = np.flatnonzero(are_new) if are_new.sum() >= _MIN_IMAGES else np.arange(len(stamps))
     count, why = frames_for(speeds[kept]) if count is None else (count, None)
     if why and len(kept) < len(stamps):
@@ -495,7 +493,7 @@ def measure(video: Path, progress: Progress, threads: int | None = None) -> tupl
         Then (h, w), the greatest value of each pixel.
 
     Raises:
-        ValueError: where the file is no video, ends too early, or has a single frame.
+        ValueError: where the file is no video, ends too early, or has fewer than three frames.
 
     **Cost** one decoding, and about 13 ms a frame.
     """
@@ -517,7 +515,7 @@ def measure(video: Path, progress: Progress, threads: int | None = None) -> tupl
 
 
 def _refuse(video: Path, log: Log, count: int) -> None:
-    """Refuse what gives no frames, one frame, or fewer than the file promises."""
+    """Refuse what gives no frames, too few, or fewer than the file promises."""
     stamps, text = log.stamps, "".join(log.rest)
     if not count:
         got = "another file; choose a video, or images="
@@ -526,8 +524,8 @@ def _refuse(video: Path, log: Log, count: int) -> None:
                 got = "one that was cut off; copy it again"
         got = "sound alone; choose a video" if "matches no streams" in text else got
         raise mismatch(video, "a video", got)
-    if count == 1:
-        raise mismatch(video, "a video of many frames", "one frame")
+    if count < _MIN_IMAGES:
+        raise mismatch(video, "a video of many frames", count, "film longer")
     if len(stamps) < count or not np.all(np.diff(stamps[:count]) > 0):
         expected = "a time stamp for each frame, each later than the one before"
         got = f"{len(stamps)} for {count} frames"
