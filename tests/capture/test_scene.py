@@ -108,7 +108,7 @@ def test_facts_are_those_of_the_capture_and_are_told_with_advice():
     sizes = dict.fromkeys(times, (320, 240))
     frames = Frames(Path("pictures"), None, times, range(14), 14, 1.0, sizes, originals)
     limits = Limits(0.5, 2.0, Box((-1, -1, -1), (1, 2, 3)))
-    facts = facts_of(Source(images=Path("p")), frames, found, limits, [2], 0.12)
+    facts = facts_of(Source(images=Path("p")), frames, found, limits, None) | {"moving": 0.12}
     chord = 2 * 4 * np.sin(np.radians(70 / 11) / 2)
     assert facts["path"] == pytest.approx(11 * chord)
     assert facts["camera"]["degrees"] == pytest.approx(2 * np.degrees(np.arctan(160 / 300)))
@@ -143,6 +143,6 @@ def test_what_is_burnt_in_is_said_and_no_frame_trains_on_it(tmp_path):
         scene = read_scene(tmp_path, "hand", scale=scale)
         for frame in (*scene.train, *scene.test):
             np.testing.assert_array_equal(frame.load_valid(), ~burnt[::scale, ::scale])
-    said = summary(facts_of(source, frames, found, limits, *written, burnt))
+    said = summary(facts_of(source, frames, found, limits, burnt) | written)
     start = "burnt in: a logo or a caption in 2.6 % of the images (top right), left out of poses"
     assert any(line.startswith(start) for line in said)

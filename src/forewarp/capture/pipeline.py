@@ -83,7 +83,7 @@ def capture(
             written = scene.write(folder, source.video is not None, images, found, limits, progress, burnt)
             if limits is not None:
                 write_png(folder / PICTURE, scene.draw(found, limits))
-            facts = scene.facts_of(source, images, found, limits, *written, burnt)
+            facts = scene.facts_of(source, images, found, limits, burnt) | written
             record(folder, facts)
     return facts
 

@@ -420,12 +420,12 @@ def capture_rig(
             }
         used = [mine for mine in taken if mine.film.name not in lost]
         images, every = _frames_of(work, used, found, why, step)
-        with step("writing") as progress, folder_written_whole(out, ABOUT) as written:
+        with step("writing") as progress, folder_written_whole(out, ABOUT) as whole:
             of_frames = dataclasses.replace(found, cameras=every)
-            scales, moving = scene.write(written, is_timed, images, of_frames, limits, progress)
-            unmasked = f"{masks}: {NO_MASKS}" if masks is not None and not moving else None
+            written = scene.write(whole, is_timed, images, of_frames, limits, progress)
+            unmasked = f"{masks}: {NO_MASKS}" if masks is not None and not written["moving"] else None
             owner = {name: mine.film.name for mine in taken for name in mine.looks}
-            write_png(written / PICTURE, scene.draw(found, limits, [owner[name] for name in found.cameras]))
+            write_png(whole / PICTURE, scene.draw(found, limits, [owner[name] for name in found.cameras]))
             facts = {
                 "source": str(folder),
                 "cameras": cameras,
@@ -439,10 +439,9 @@ def capture_rig(
                 "pictures": len(images.times),
                 "registered": len(every),
                 **scene.facts_of_space(found, limits),
-                "scales": scales,
-                "moving": moving,
+                **written,
             }
-            record(written, facts)
+            record(whole, facts)
     return facts
 
 

@@ -129,7 +129,7 @@ def write(
     limits: Limits | None,
     progress: Progress,
     burnt: np.ndarray | None = None,
-) -> tuple[list[int], float | None]:
+) -> dict:
     """Write the scene of all registered images, smaller copies of them, and masks of what moves: those that
     were given, else those of ``motion.moving_masks``; none of several cameras, or where these cannot tell.
 
@@ -143,7 +143,8 @@ def write(
         burnt: (H, W) bool, true where something is burnt into all images; not to be trained on.
 
     Returns:
-        how many times smaller the copies are, and which share of all pixels moves; None without masks.
+        ``scales``, how many times smaller the copies are, and ``moving``, which share of all pixels moves;
+        None without masks.
     """
     names = sorted(found.cameras, key=lambda name: frames.times[name])
     paths, cameras = [frames.folder / name for name in names], [found.cameras[name] for name in names]
@@ -198,7 +199,7 @@ def write(
     told |= {"moving_from": moving_from, "mask": None if burnt is None else MASK}
     told["seconds"] = times[-1] - times[0] if in_seconds else None
     write_scene(folder, shots(), points=found.sure(), **told)
-    return scales, None if moving_from is None else share
+    return {"scales": scales, "moving": None if moving_from is None else share}
 
 
 def draw(found: Reconstruction, limits: Limits, taken_by: Sequence[str] | None = None) -> Tensor:
@@ -256,15 +257,9 @@ def _frustum(camera: Camera, depth: float) -> np.ndarray:
 
 
 def facts_of(
-    source: Source,
-    frames: Frames,
-    found: Reconstruction,
-    limits: Limits | None,
-    scales: list[int],
-    moving: float | None,
-    burnt: np.ndarray | None = None,
+    source: Source, frames: Frames, found: Reconstruction, limits: Limits | None, burnt: np.ndarray | None
 ) -> dict:
-    """Gather the numbers of ``capture.json``."""
+    """Gather the numbers of ``capture.json``, but for those that ``write`` returns."""
     times = [frames.times[name] for name in found.cameras]
     left_out = sorted(frames.times.keys() - found.cameras.keys())
     return {
@@ -285,8 +280,6 @@ def facts_of(
         "path": float(np.linalg.norm(np.diff(found.centers, axis=0), axis=1).sum()),
         "has_nearer": limits is not None and limits.has_nearer,
         **facts_of_space(found, limits),
-        "scales": scales,
-        "moving": moving,
     }
 
 
@@ -349,16 +342,13 @@ def summary(facts: dict) -> list[str]:
     if facts["assumed"]:
         lines.append(f"assumed: {facts['assumed']}")
     if burnt := facts["burnt_in"]:
-        lines.append(
-            f"burnt in: a logo or a caption in {100 * burnt['share']:.1f} % of the images "
-            f"({', '.join(burnt['places'])}), left out of poses and not trained on: {MASK}; crop it away "
-            "before, or set data.masks=off to train on it"
-        )
+        where = f"{100 * burnt['share']:.1f} % of the images ({', '.join(burnt['places'])})"
+        left_out = f"burnt in: a logo or a caption in {where}, left out of poses and not trained on: {MASK}"
+        lines.append(f"{left_out}; crop it away before, or set data.masks=off to train on it")
     if facts["has_nearer"]:
-        lines.append(
-            f"near: expected points from {facts['near']:.2g} on, but got nearer ones, as captions or logos "
-            "in the pictures make them, which also bend poses; give masks= in which these are bright"
-        )
+        near = f"near: expected points from {facts['near']:.2g} on, but got nearer ones, as captions or logos"
+        advice = "give masks= in which these are bright"
+        lines.append(f"{near} in the pictures make them, which also bend poses; {advice}")
     if facts["left_out"]:
         few = ", ".join(facts["left_out"][:3])
         advice = "; film slower and with more of what stands still" if facts["searched"] else ""
