@@ -175,8 +175,7 @@ def taken(tmp_path, source, masks=None, count=4, size=None, colmap=None):
     work = tmp_path / "work"
     work.mkdir(exist_ok=True)
     kind = "video" if source.suffix == ".mp4" else "images"
-    source = Source(**{kind: source}, masks=masks, colmap=colmap)
-    return take(work, source, step, count=count, size=size)
+    return take(work, Source(**{kind: source}, masks=masks, colmap=colmap, size=size), step, count, None)
 
 
 def test_frames_bear_their_numbers_and_stamps_and_are_taken_once(tmp_path):
@@ -208,7 +207,7 @@ def test_black_bars_are_cut_off_and_told(tmp_path, rotation):
     pictures.mkdir()
     for i in (0, 4, 8):
         Image.fromarray(np.pad(frames[i], ((0, 0), (20, 20), (0, 0)))).save(pictures / f"{i}.png")
-    told = take(tmp_path, Source(images=pictures), step, count=None, size=None)
+    told = take(tmp_path, Source(images=pictures), step, None, None)
     assert told.assumed == "black bars, 12% at the left and right each, stay: crop the pictures"
     pixels = np.asarray(Image.open(images.folder / next(iter(images.times))))[..., 0]
     assert pixels.max(1).min() > 150
@@ -426,7 +425,7 @@ def test_what_may_be_hdr_but_does_not_say_so_is_told(tmp_path, tags, bits, told)
     made = ["-f", "lavfi", "-i", "testsrc=s=64x48:r=4:d=1", "-vf", f"format=yuv420p{depth},setparams={tags}"]
     call = [imageio_ffmpeg.get_ffmpeg_exe(), "-v", "error", *made, *options, "-c:v", "ffv1", str(film)]
     subprocess.run(call, check=True)
-    shown = take(tmp_path, Source(video=film), step, count=3, size=None).assumed
+    shown = take(tmp_path, Source(video=film), step, 3, None).assumed
     assert (shown or "").startswith("10 bits or more of BT.2020 without a transfer are taken") == told
 
 

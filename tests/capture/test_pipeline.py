@@ -68,7 +68,7 @@ def test_a_film_whose_poses_fail_is_tried_with_more_frames(tmp_path, monkeypatch
     (tmp_path / "a.mp4").touch()
     tried = []
 
-    def take(work, source, step, *, count, size, threads, why="none"):
+    def take(work, source, step, count, threads, why="none"):
         (work / "pictures.json").touch()
         names = [f"{i:03d}" for i in range(count or 200)]
         return Frames(work, None, dict.fromkeys(names, 0.0), range(len(names)), 600, 2.0, {}, {}, why=why)

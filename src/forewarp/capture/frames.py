@@ -47,19 +47,22 @@ _UNSAID = (
     "10 bits or more of BT.2020 without a transfer are taken for SDR; if colours look faded, tag it as HLG "
     "(ffmpeg -i IN -c copy -color_trc arib-std-b67 OUT.mp4) or PQ (smpte2084)"
 )
+_ASKED = "frames= says so"  # why so many frames are taken
 _DAMAGE = re.compile("partial file|ended prematurely|corrupt")
 
 
 @dataclass(frozen=True)
 class Source:
-    """What to capture: a ``video``, or a folder of ``images``, with ``colmap`` poses that are known; and a
-    folder of ``masks`` of what moves.
+    """What to capture: a ``video``, or a folder of ``images``, with ``colmap`` poses that are known; a folder
+    of ``masks`` of what moves; and ``size``, the most pixels of the longer side, None: as they are. With
+    poses that are known images are left as stored.
     """
 
     video: Path | None = None
     images: Path | None = None
     colmap: Path | None = None
     masks: Path | None = None
+    size: int | None = 1600
 
     @property
     def path(self) -> Path:
@@ -103,23 +106,15 @@ class Frames:
 
 
 def take(
-    work: Path,
-    source: Source,
-    step: Step,
-    *,
-    count: int | None,
-    size: int | None,
-    threads: int | None = None,
-    why: str = "frames= says so",
+    work: Path, source: Source, step: Step, count: int | None, threads: int | None, why: str = _ASKED
 ) -> Frames:
     """Take the images out of a video or a folder, unless an earlier call has done so.
 
     Args:
         work: the work folder.
-        source: what to capture. With poses that are known images stay as stored: neither turned nor smaller.
+        source: what to capture. With poses that are known images are neither turned nor made smaller.
         step: shows progress.
         count: of frames to choose from a video; None: see ``frames_for``. Images of a folder are all taken.
-        size: most pixels of the longer side; None: as they are.
         threads: of ffmpeg; None: as many as it likes.
         why: so many frames, where ``count`` is given.
 
@@ -132,10 +127,10 @@ def take(
         for left in (folder, dark):
             shutil.rmtree(left, ignore_errors=True)
         if source.video is not None:
-            done = _from_video(folder, source, count, size, step, threads)
+            done = _from_video(folder, source, count, step, threads)
             done["why"] = done["why"] or why
         else:
-            done = _from_folder(folder, source, size, step)
+            done = _from_folder(folder, source, step)
         of_images = (done[key] for key in ("sizes", "rows", "found", "originals"))
         if source.masks is not None and not write_masks(dark, source.masks, *of_images):
             raise ValueError(f"{source.masks}: {NO_MASKS}")
@@ -144,9 +139,7 @@ def take(
     return Frames(folder, dark if source.masks else None, **done | {"sizes": sizes})
 
 
-def _from_video(
-    folder: Path, source: Source, count: int | None, size: int | None, step: Step, threads: int | None
-) -> dict:
+def _from_video(folder: Path, source: Source, count: int | None, step: Step, threads: int | None) -> dict:
     """Write the sharpest frames without black bars, named after their numbers in the video, from 1."""
     video = source.video
     with step("looking at frames") as progress:
@@ -163,7 +156,7 @@ def _from_video(
     changed = [f"{HDR[transfer]}, tone-mapped to SDR"] if transfer else []
     changed += ["interlaced, made whole"] if deinterlacing(video) else []
     with step("taking frames" + (f" ({'; '.join(changed)})" if changed else "")) as progress:
-        for index, pixels in zip(chosen, extracted(video, chosen, size, threads, bars)):
+        for index, pixels in zip(chosen, extracted(video, chosen, source.size, threads, bars)):
             name = f"frame_{index + 1:06d}.jpg"
             write_image(folder / name, pixels)
             times[name] = float(stamps[index])
@@ -237,7 +230,7 @@ def frames_for(speeds: np.ndarray) -> tuple[int, str]:
     return count, f"what is fast moves by {float(speeds.mean()):.2g} pixels of 640 a frame{bound}"
 
 
-def _from_folder(folder: Path, source: Source, size: int | None, step: Step) -> dict:
+def _from_folder(folder: Path, source: Source, step: Step) -> dict:
     """Copy images; times are even, in the order of the names.
 
     Without known poses all have one size. With them, images may lie in subfolders, and those of several
@@ -272,7 +265,7 @@ def _from_folder(folder: Path, source: Source, size: int | None, step: Step) -> 
                 few = "one of few that have it"
                 raise mismatch(path, "alpha in all pictures or in none", few, "remove it")
             pixels = pixels if has_alpha else pixels[..., :3]
-            pixels = pixels if as_stored else within(pixels, size)
+            pixels = pixels if as_stored else within(pixels, source.size)
             is_png = has_alpha or path.suffix.lower() == ".png"
             name = f"picture_{done:06d}{'.png' if is_png else '.jpg'}"
             write_image(folder / name, pixels)

@@ -30,14 +30,7 @@ _STATE = "about.json"  # what the work in a work folder depends on
 
 
 def capture(
-    source: Source,
-    out: Path,
-    search: Search,
-    step: Step,
-    *,
-    frames: int | None = None,
-    size: int | None = 1600,
-    force: bool = False,
+    source: Source, out: Path, search: Search, step: Step, *, frames: int | None = None, force: bool = False
 ) -> dict:
     """Make a scene in ``out`` and return what was found, which ``capture.json`` there holds too.
 
@@ -50,15 +43,14 @@ def capture(
         step: gives a ``Progress`` for each step.
         frames: to choose from a video; None: see ``frames.frames_for``, and twice as many where these do not
             register.
-        size: most pixels of the longer side; with poses that are known images are left as stored.
         force: go on where matches say that the camera stands or only turns, or known poses seem wrong.
 
     Raises:
         ValueError: where nothing good comes of it, with advice; frames, features and matches stay.
     """
-    about = {**dataclasses.asdict(source), "frames": frames, "size": size}
+    about = {**dataclasses.asdict(source), "frames": frames}
     with work_for(out, search, (source.path, source.masks), **about) as work:
-        images = take(work, source, step, count=frames, size=size, threads=search.threads)
+        images = take(work, source, step, frames, search.threads)
         if source.colmap is not None:
             found = poses.read_model(source.colmap, images.originals)
         else:
@@ -73,7 +65,7 @@ def capture(
                 for left in work.iterdir():
                     if left.name != _STATE:
                         shutil.rmtree(left) if left.is_dir() else left.unlink()
-                images = take(work, source, step, count=more, size=size, threads=search.threads, why=_AGAIN)
+                images = take(work, source, step, more, search.threads, _AGAIN)
                 found = find_poses(work, images, search, step, force)
         refuse_poses(found, images, force=force)
         found = scene.placed(found)

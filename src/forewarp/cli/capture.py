@@ -66,16 +66,16 @@ def capture(config) -> None:
     from forewarp.progress import Counted
 
     search = Search(config.matching, config.lens, config.features, config.seed, config.threads)
-    options = {"frames": config.frames, "size": config.size, "force": config.force}
+    options = {"frames": config.frames, "force": config.force}
     videos, held = source.pop("videos"), []
     if is_scan(source["video"]):
         facts = record3d.capture_record3d(source["video"], out, Counted, ABOUT, config.frames)
         lines = record3d.summary(facts)
     elif videos is None:
-        facts = capture(Source(**source), out, search, Counted, **options)
+        facts = capture(Source(**source, size=config.size), out, search, Counted, **options)
         lines = scene.summary(facts)
     else:
-        options |= OmegaConf.to_container(OmegaConf.masked_copy(config, list(RIG)))
+        options |= OmegaConf.to_container(OmegaConf.masked_copy(config, ["size", *RIG]))
         facts = rig.capture_rig(videos, out, search, Counted, masks=source["masks"], **options)
         lines, posed = rig.summary(facts), [name for name in facts["cameras"] if name not in facts["lost"]]
         # One in the middle, as the outermost see what no other does.
