@@ -12,7 +12,7 @@ import re
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import combinations, product
+from itertools import chain, combinations, product
 from pathlib import Path
 from urllib.parse import quote
 
@@ -99,15 +99,11 @@ class Recording:
                     raise mismatch(self.images[row], expected, got, _without(self.name))
                 yield within(pixels, size)
             return
+        films, count = [extracted(self.path, list(rows), size, threads)], 0
         if len(rows) * _SEEK < rows[-1]:
             starts = (start_of(self.stamps, row) for row in rows)
-            sought = (extracted(self.path, [0], size, threads, start=start) for start in starts)
-            found = (frame for film in sought for frame in film)
-        else:
-            found = extracted(self.path, list(rows), size, threads)
-        count = 0
-        for pixels in found:
-            count += 1
+            films = (extracted(self.path, [0], size, threads, start=start) for start in starts)
+        for count, pixels in enumerate(chain.from_iterable(films), 1):
             yield pixels
         if count < len(rows):
             got = f"{count} of {len(rows)}"
