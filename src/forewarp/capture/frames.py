@@ -78,7 +78,8 @@ class Frames:
         folder: of the images, whose names are ours and sort by time.
         masks: a folder in which black is what moves; None: there are none.
         times: seconds or numbers, by name.
-        rows: which of those found each image is.
+        rows: which of those found each image is. Of a rig this and what follows, up to ``originals``, is left
+            out.
         found: how many there were to choose from.
         edges: median width of the images' edges, in pixels of an image 640 wide.
         sizes: (width, height), by name; all alike, unless poses are known.
@@ -93,11 +94,11 @@ class Frames:
     folder: Path
     masks: Path | None
     times: dict[str, float]
-    rows: Sequence[int]
-    found: int
-    edges: float
-    sizes: dict[str, tuple[int, int]]
-    originals: Mapping[str, str]
+    rows: Sequence[int] = ()
+    found: int = 0
+    edges: float = 0.0
+    sizes: Mapping[str, tuple[int, int]] = field(default_factory=dict)
+    originals: Mapping[str, str] = field(default_factory=dict)
     assumed: str | None = None
     why: str | None = None
     masks_from: str = "the masks given"

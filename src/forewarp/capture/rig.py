@@ -618,7 +618,7 @@ def _frames_of(
 ) -> tuple[Frames, dict]:
     """Take the frames of all films and mask what moves; also return the camera of each that has a pose."""
     total, before, told, masks = sum(len(mine.rows) for mine in taken), 0, set(), work.folder / "masks"
-    times, moments, taken_by, sizes, cameras = {}, {}, {}, {}, {}
+    times, moments, taken_by, cameras = {}, {}, {}, {}
     with step("frames, what moves") as progress:
         for mine in taken:
             film, names, still = mine.film, mine.names, None
@@ -627,8 +627,6 @@ def _frames_of(
             work.take(mine, still, lambda done, _, before=before: progress(before + done, total))
             before += len(names)
             progress(before, total)
-            size = read_json(work.folder / "pictures" / f"{film.name}.json")["size"]
-            sizes |= dict.fromkeys(names, tuple(size))
             taken_by |= dict.fromkeys(names, film.name)
             times |= zip(names, mine.times)
             moments |= zip(names, mine.moments)
@@ -637,6 +635,7 @@ def _frames_of(
             cameras |= posed
             if work.masks is None and not mine.is_fixed and posed:
                 paths = [work.folder / "pictures" / name for name in posed]
+                size = read_json(work.folder / "pictures" / f"{film.name}.json")["size"]
                 nothing, known = np.zeros(size[::-1], bool), 0
                 for name, mask in zip(posed, moving_masks(paths, list(posed.values()))):
                     known += mask is not None
@@ -644,10 +643,9 @@ def _frames_of(
                 told.add(2 * known > len(posed) and "optical flow")
             elif posed:
                 told.add("the masks given" if work.masks else "differences from what is mostly there")
-    options = {"why": why, "masks_from": " and ".join(sorted(map(str, told)))}
-    options |= {"cameras": taken_by, "moments": moments}
-    dark = None if False in told else masks
-    images = Frames(work.folder / "pictures", dark, times, range(total), total, 0.0, sizes, {}, **options)
+    dark, by_camera = None if False in told else masks, {"cameras": taken_by, "moments": moments}
+    sources = " and ".join(sorted(map(str, told)))
+    images = Frames(work.folder / "pictures", dark, times, why=why, masks_from=sources, **by_camera)
     return images, dict(sorted(cameras.items(), key=lambda pair: times[pair[0]]))
 
 
