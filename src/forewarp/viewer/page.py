@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +21,7 @@ from forewarp.scene.camera import Camera
 from forewarp.scene.cloud import Ellipsoids
 from forewarp.scene.frame import spread
 from forewarp.viewer.queue import Cancelled
-from forewarp.viewer.rendering import SPLATS, Viewer, first_frame, turning_axis, vertical_fov
+from forewarp.viewer.rendering import SPLATS, Viewer, ViewState, first_frame, turning_axis, vertical_fov
 from forewarp.viewer.session import MAX_VIDEO_SECONDS, MIN_VIDEO_SECONDS, Session
 
 _MOVED = 1e-3  # of the distance to the pivot: a camera that went farther has left the training view
@@ -189,17 +190,13 @@ class Page:
     def _add_camera(self, index: int) -> viser.CameraFrustumHandle:
         frame = self.viewer.scene.train[index]
         camera, color = frame.camera, hues(torch.tensor(0.8 * frame.time)).mul(255).int()
-        frustum = self.client.scene.add_camera_frustum(
-            f"/cameras/{index}",
-            fov=vertical_fov(camera),
-            aspect=camera.width / camera.height,
-            scale=0.05 * float((camera.center - self.viewer.focus).norm()),
-            color=tuple(color.tolist()),
-            wxyz=SO3.from_matrix(camera.camera_to_world[:3, :3].numpy()).wxyz,
-            position=camera.center.numpy(),
-            # A line alone is hard to hit.
-            **{"thickness": 1.5, "thickness_units": "screen", "variant": "filled", "visible": False},
-        )
+        turn = SO3.from_matrix(camera.camera_to_world[:3, :3].numpy()).wxyz
+        shape = {"fov": vertical_fov(camera), "aspect": camera.width / camera.height}
+        shape["scale"] = 0.05 * float((camera.center - self.viewer.focus).norm())
+        # A line alone is hard to hit.
+        look = {"thickness": 1.5, "thickness_units": "screen", "variant": "filled", "visible": False}
+        place = {"wxyz": turn, "position": camera.center.numpy(), "color": tuple(color.tolist())}
+        frustum = self.client.scene.add_camera_frustum(f"/cameras/{index}", **shape, **place, **look)
         on_press(frustum, lambda: self.show_training_view(index))
         return frustum
 
@@ -281,13 +278,9 @@ class Page:
         def tell(text: str) -> None:
             status.content = text
 
-        def add_key() -> None:
-            keys.append(self.session.state)
+        def set_keys(*states: ViewState) -> None:
+            keys[:] = states
             tell(f"{len(keys)} key views")
-
-        def clear_keys() -> None:
-            keys.clear()
-            tell("0 key views")
 
         def make_video(_: viser.GuiEvent) -> None:
             make.disabled = True
@@ -296,8 +289,8 @@ class Page:
             finally:
                 make.disabled = False
 
-        on_press(add, add_key)
-        on_press(clear, clear_keys)
+        on_press(add, lambda: set_keys(*keys, self.session.state))
+        on_press(clear, set_keys)
         make.on_click(make_video)  # in a thread of its own, as it waits
 
     # What waits for images.
@@ -305,21 +298,16 @@ class Page:
     def save_screenshot(self) -> None:
         """Send the image as a file, or say why there is none."""
         state = self.session.state
-        try:
+        with told_if_it_fails("screenshot", self.tell):  # also by a browser that does not answer
             if state.drawn_by_browser:
                 width, height = self.canvas()
                 drawn = self.client.get_render(height, width, transport_format="png", timeout=30)
                 image = torch.from_numpy(drawn[..., :3] / 255.0)
             else:
                 image = self.session.image(state, priority=1)
-        except Cancelled:
-            return
-        except Exception as error:  # what went wrong while it was drawn, or a browser that does not answer
-            self.tell(f"no screenshot: {reason(error)}")
-            return
-        names = "-".join(renderer.name for renderer in self.viewer.renderers)
-        name = f"{self.viewer.scene.name}-{names}-{state.channel}-{state.time:.3f}.png"
-        self.client.send_file_download(name, png_bytes(image), save_immediately=True)
+            names = "-".join(renderer.name for renderer in self.viewer.renderers)
+            name = f"{self.viewer.scene.name}-{names}-{state.channel}-{state.time:.3f}.png"
+            self.client.send_file_download(name, png_bytes(image), save_immediately=True)
 
     def save_video(self, keys: list, seconds: float, tell: Callable[[str], None]) -> None:
         """Write and send a video through key views, or say why there is none."""
@@ -327,15 +315,10 @@ class Page:
         def progress(done: int, total: int) -> None:
             tell(f"{done} of {total} images")
 
-        try:
+        with told_if_it_fails("video", tell):  # also while an image is rendered
             file = self.session.write_video(self.folder, keys, seconds, progress)
-        except Cancelled:
-            return
-        except Exception as error:  # also what went wrong while an image was rendered
-            tell(f"no video: {reason(error)}")
-            return
-        tell(f"written: {file}")
-        self.client.send_file_download(file.name, file.read_bytes(), save_immediately=True)
+            tell(f"written: {file}")
+            self.client.send_file_download(file.name, file.read_bytes(), save_immediately=True)
 
 
 def fitted_fov(camera: Camera, width: float, height: float) -> float:
@@ -356,10 +339,18 @@ def splat_arrays(cloud: Ellipsoids, unit: float) -> list[np.ndarray]:
     return [part.cpu().numpy() for part in parts]
 
 
-def reason(error: Exception) -> str:
-    """Say what went wrong; its kind too, where its words are none of ours."""
-    is_ours = isinstance(error, ValueError) or getattr(error, "errno", None) is not None
-    return str(error) if is_ours else f"{type(error).__name__}: {error}"
+@contextmanager
+def told_if_it_fails(what: str, tell: Callable[[str], None]) -> Iterator[None]:
+    """Say why there is none of ``what``, unless it is no longer wanted; the kind of an error too, where its
+    words are none of ours.
+    """
+    try:
+        yield
+    except Cancelled:
+        pass
+    except Exception as error:
+        is_ours = isinstance(error, ValueError) or getattr(error, "errno", None) is not None
+        tell(f"no {what}: " + (str(error) if is_ours else f"{type(error).__name__}: {error}"))
 
 
 def on_edit(control, act: Callable) -> None:
