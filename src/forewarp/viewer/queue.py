@@ -42,9 +42,9 @@ class RenderQueue:
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock, self._numbers = clock, count()
-        self._waiting: dict[tuple, _Request] = {}
-        self._newest: dict[tuple, _Request] = {}  # waiting or running
-        self._running: tuple[tuple, _Request] | None = None
+        self._waiting: dict[tuple, _Request] = {}  # by page and kind
+        self._wanted: tuple | None = None  # page and kind of the job that is running, while it is wanted
+        self._running = False
         self._changed = threading.Condition()
         self.closed = False
 
@@ -59,23 +59,22 @@ class RenderQueue:
             delay: seconds to wait before the job may run.
         """
         with self._changed:
-            request = _Request(priority, next(self._numbers), self._clock() + delay, job)
-            self._waiting[page, kind] = self._newest[page, kind] = request
+            due = self._clock() + delay
+            self._waiting[page, kind] = _Request(priority, next(self._numbers), due, job)
+            self._wanted = None if self._wanted == (page, kind) else self._wanted
             self._changed.notify()
 
     def cancel(self, page: Hashable) -> None:
         """Cancel all that a page has submitted."""
         with self._changed:
-            for requests in (self._waiting, self._newest):
-                for key in [key for key in requests if key[0] == page]:
-                    del requests[key]
+            self._waiting = {key: request for key, request in self._waiting.items() if key[0] != page}
+            self._wanted = None if self._wanted and self._wanted[0] == page else self._wanted
 
     def close(self) -> None:
         """Cancel everything; ``run_next`` returns at once from now on."""
         with self._changed:
-            self.closed = True
+            self.closed, self._wanted = True, None
             self._waiting.clear()
-            self._newest.clear()
             self._changed.notify()
 
     def has_due_job(self) -> bool:
@@ -90,43 +89,38 @@ class RenderQueue:
 
         A job that fails is reported on stderr and ends alone.
         """
-        self._running = self._take(wait)
-        if self._running is None:
+        job = self._take(wait)
+        if job is None:
             return False
-        key, request = self._running
+        self._running = True
         try:
-            request.job()
+            job()
         except Cancelled:
             pass
         except Exception as error:
             traceback.print_exception(error)
         finally:
-            self._running = None
-            with self._changed:
-                if self._newest.get(key) is request:
-                    del self._newest[key]
+            self._running, self._wanted = False, None
         return True
 
     def is_stale(self) -> bool:
         """Tell whether the running job, if any, is no longer wanted."""
-        if self._running is None:
-            return False
-        key, request = self._running
-        return self.closed or self._newest.get(key) is not request
+        return self._running and self._wanted is None
 
     def run_forever(self) -> None:
         """Run job after job until the queue is closed."""
         while not self.closed:
             self.run_next(1.0)
 
-    def _take(self, wait: float) -> tuple[tuple, _Request] | None:
-        """Wait for the first job that is due."""
+    def _take(self, wait: float) -> Job | None:
+        """Wait for the first job that is due; it is wanted from now on."""
         end = self._clock() + wait
         with self._changed:
             while not self.closed:
                 key, now = self._first(), self._clock()
                 if key is not None:
-                    return key, self._waiting.pop(key)
+                    self._wanted = key
+                    return self._waiting.pop(key).job
                 if now >= end:
                     return None
                 next_due = min((request.due for request in self._waiting.values()), default=end)
