@@ -193,26 +193,21 @@ def check_address(host: str, port: int) -> None:
         ValueError: saying what to type in its place.
     """
     if type(host) is not str or not host:
-        raise ValueError(
-            f"host: expected an address of this machine, but got {host or 'nothing'}; use host=127.0.0.1"
-        )
+        got = host or "nothing"
+        raise ValueError(f"host: expected an address of this machine, but got {got}; use host=127.0.0.1")
     if not (type(port) is int and 0 <= port < 65536):
         raise ValueError(f"port: expected a whole number from 0 to 65535, but got {port}")
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     try:
         socket.create_server((host, port), family=family).close()
     except OSError as error:
+        expected = f"an address of this machine that port {port} may be opened on"
+        told = f"host: expected {expected}, but got {host} ({error.strerror or error}); use host=127.0.0.1"
         if error.errno == errno.EADDRINUSE:
-            raise ValueError(port_in_use(port)) from None
-        if error.errno == errno.EACCES:
-            raise ValueError(
-                f"port: expected one that you may open, but got {port}, which is kept for the system; "
-                "use port=8080"
-            ) from None
-        raise ValueError(
-            f"host: expected an address of this machine that port {port} may be opened on, but got {host} "
-            f"({error.strerror or error}); use host=127.0.0.1"
-        ) from None
+            told = port_in_use(port)
+        elif error.errno == errno.EACCES:
+            told = f"port: expected one that you may open, but got {port}, kept for the system; use port=8080"
+        raise ValueError(told) from None
 
 
 def port_in_use(port: int) -> str:
