@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 
 import torch
 from torch import Tensor
@@ -124,9 +124,9 @@ class SceneRenderer:
         self.targets = datamodule.targets("train")
         self.background = self.targets.background
         self.renewal, self.tracks = renewal, tracks
-        self._layers: dict[str, Method] = {}
         self._snapshots: list[tuple[str, Snapshot]] = []  # with their layers
         self._trajectories: tuple[float, Trajectories] | None = None
+        self._layer_of = lru_cache(len(LAYERS))(partial(layer_of, may_be_empty=True))
         self._canonical = lru_cache(_POINTS)(self.canonical_point)
         self._followed = lru_cache(_PATHS)(self._follow)
 
@@ -144,15 +144,12 @@ class SceneRenderer:
 
     def method_of(self, layer: str) -> Method:
         """Return the method, or the part of it that is a layer; there may be nothing in that."""
-        if layer == LAYERS[0]:
-            return self.module.method
-        if layer not in self._layers:
-            self._layers[layer] = layer_of(self.module.method, layer, self.scene.train, may_be_empty=True)
-        return self._layers[layer]
+        method = self.module.method
+        return method if layer == LAYERS[0] else self._layer_of(method, layer, self.scene.train)
 
     def invalidate(self) -> None:
         """Forget what was computed from the method's parameters, which have changed."""
-        self._layers.clear()
+        self._layer_of.cache_clear()
         self._snapshots.clear()
         self._canonical.cache_clear()
         self._followed.cache_clear()
@@ -248,18 +245,16 @@ class SceneRenderer:
         now = method.trajectories(matter, matter.new_tensor([time]))[:, 0]
         return matter[(now - now.new_tensor(point)).norm(dim=-1).argmin()]
 
-    def _overlays(self, state: ViewState) -> list[Trajectories]:
-        """Return what is drawn over an image: points all over the moving surface, and those followed."""
-        overlays = []
+    def _overlays(self, state: ViewState) -> Iterator[Trajectories]:
+        """Yield what is drawn over an image: points all over the moving surface, and those followed."""
         if self.can_follow and state.trajectories:
             now = time.monotonic()
             if self._trajectories is None or now - self._trajectories[0] > self.renewal:
                 cameras = [frame.camera for frame in self.scene.train]
                 self._trajectories = now, Trajectories(self.module, cameras, **self.tracks)
-            overlays.append(self._trajectories[1])
+            yield self._trajectories[1]
         if self.can_follow and state.followed:
-            overlays.append(self._followed(state.followed))
-        return overlays
+            yield self._followed(state.followed)
 
     def _follow(self, followed: tuple[tuple[Point, float], ...]) -> Trajectories:
         points = torch.stack([self._canonical(*point_and_time) for point_and_time in followed])
