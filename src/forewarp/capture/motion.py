@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 import torch
 
+from forewarp.capture.frames import Progress
 from forewarp.data.images import read_image
 from forewarp.scene.camera import Camera
 
@@ -52,6 +53,25 @@ def moving_masks(paths: Sequence[Path], cameras: Sequence[Camera]) -> Iterator[n
     film = _Film(paths, cameras)
     for i in range(len(paths)):
         yield film.where(_OFF, film.tracks(i, range(i - _REACH, i + _REACH + 1)))
+
+
+def film_masks(
+    paths: Sequence[Path], cameras: Sequence[Camera], progress: Progress = lambda *_: None
+) -> list[np.ndarray] | None:
+    """Return the masks of ``moving_masks``, with nothing in those that are None; None where most are.
+
+    Args:
+        paths, cameras: see ``moving_masks``.
+        progress: called with images done and all.
+    """
+    masks = []
+    for mask in moving_masks(paths, cameras):
+        masks.append(mask)
+        progress(len(masks), len(paths))
+    known = [mask for mask in masks if mask is not None]
+    if 2 * len(known) <= len(masks):
+        return None
+    return [np.zeros_like(known[0]) if mask is None else mask for mask in masks]
 
 
 def resting_masks(

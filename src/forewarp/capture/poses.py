@@ -50,6 +50,7 @@ _READINGS = {  # what else may be in a model
 }
 _SAME_PLACE = 1e-6  # of the distance from the origin; models have six digits or more
 _PLACES = ("", "sparse/0", "sparse", "colmap/sparse/0")  # of a model in a folder that is given
+Pairs = Sequence[tuple[str, str]]  # of images, by their names
 _PARAMETERS = {"f", "fx", "fy", "cx", "cy", "k", "k1", "k2", "k3", "p1", "p2"}
 
 
@@ -262,11 +263,7 @@ def first_look(count: int) -> int:
 
 
 def match(
-    database: Path,
-    search: Search,
-    progress: Progress,
-    every: int | None = None,
-    named: Sequence[tuple[str, str]] | None = None,
+    database: Path, search: Search, progress: Progress, every: int | None = None, named: Pairs | None = None
 ) -> None:
     """Match and verify the pairs of images that are not matched yet: those ``named``; None: see ``pairs_of``,
     or a few of each ``every``-th image.

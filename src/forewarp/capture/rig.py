@@ -21,7 +21,7 @@ import pycolmap
 
 from forewarp.capture import frames, poses, scene
 from forewarp.capture.frames import NO_MASKS, TAKEN, Frames, Progress, Step
-from forewarp.capture.motion import Still, is_fixed, moving_masks, resized_mask
+from forewarp.capture.motion import Still, film_masks, is_fixed, resized_mask
 from forewarp.capture.pipeline import ABOUT, PICTURE, keep, kept, record, work_for
 from forewarp.capture.poses import Reconstruction, Search
 from forewarp.capture.sync import MOST as HEARD
@@ -473,7 +473,7 @@ class _Work:
             tick(done, len(mine.rows))
         if self.masks is not None:
             self.given(mine.film, mine.rows, pixels.shape[1::-1], "masks")
-        write_json(marker, {"rows": mine.rows, "size": list(pixels.shape[1::-1])})
+        write_json(marker, {"rows": mine.rows})
 
 
 def _look(work: _Work, taken: Sequence[Taken], fixed: bool | None, step: Step) -> list[Taken]:
@@ -624,15 +624,13 @@ def _frames_of(
             cameras |= posed
             if work.masks is None and not mine.is_fixed and posed:
                 paths = [work.folder / "pictures" / name for name in posed]
-                size = read_json(work.folder / "pictures" / f"{film.name}.json")["size"]
-                nothing, known = np.zeros(size[::-1], bool), 0
-                for name, mask in zip(posed, moving_masks(paths, list(posed.values()))):
-                    known += mask is not None
-                    frames.write_mask(masks / f"{name}.png", nothing if mask is None else mask)
-                told.add(2 * known > len(posed) and "optical flow")
+                of_film = film_masks(paths, list(posed.values()))
+                told.add("optical flow" if of_film else None)
+                for name, mask in zip(posed, of_film or ()):
+                    frames.write_mask(masks / f"{name}.png", mask)
             elif posed:
                 told.add("the masks given" if work.masks else "differences from what is mostly there")
-    dark, by_camera = None if False in told else masks, {"cameras": taken_by, "moments": moments}
+    dark, by_camera = None if None in told else masks, {"cameras": taken_by, "moments": moments}
     sources = " and ".join(sorted(map(str, told)))
     images = Frames(work.folder / "pictures", dark, times, why=why, masks_from=sources, **by_camera)
     return images, dict(sorted(cameras.items(), key=lambda pair: times[pair[0]]))

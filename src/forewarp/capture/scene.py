@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from forewarp.capture.frames import Frames, Progress, Source, read_mask, write_mask, write_smaller
-from forewarp.capture.motion import moving_masks, resized_mask, resting_masks
+from forewarp.capture.motion import film_masks, resized_mask, resting_masks
 from forewarp.capture.poses import Reconstruction
 from forewarp.data.images import by, common_header, read_image
 from forewarp.data.posed_video import SCALES, PosedShot, write_scene
@@ -131,7 +131,7 @@ def write(
     burnt: np.ndarray | None = None,
 ) -> dict:
     """Write the scene of all registered images, smaller copies of them, and masks of what moves: those that
-    were given, else those of ``motion.moving_masks``; none of several cameras, or where these cannot tell.
+    were given, else those of ``motion.film_masks``; none of several cameras, or where these cannot tell.
 
     Args:
         folder: to fill.
@@ -157,14 +157,9 @@ def write(
         moving_from = frames.masks_from
         masks = (read_mask(frames.masks / f"{name}.png") for name in names)
     elif is_film:
-        found_masks = []
-        for mask in moving_masks(paths, cameras):
-            found_masks.append(mask)
-            progress(len(found_masks), 2 * len(names))
-        if 2 * sum(mask is not None for mask in found_masks) > len(names):
-            moving_from = "optical flow against the cameras"
-            nothing = np.zeros(next(mask.shape for mask in found_masks if mask is not None), bool)
-            masks = [nothing if mask is None else mask for mask in found_masks]
+        of_film = film_masks(paths, cameras, lambda done, total: progress(done, 2 * total))
+        if of_film is not None:
+            masks, moving_from = of_film, "optical flow against the cameras"
     resting = {}
     if moving_from is not None and is_film:
         middle = middle_of(times)
