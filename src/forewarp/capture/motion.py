@@ -7,7 +7,7 @@ any fitted model.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -36,9 +36,11 @@ _OWN_SIDE = 320  # pixels of the longer side in which a camera's own motion is l
 _EDGES, _RESTS, _AT_REST = 20.0, 1.0, 0.5
 
 
-def moving_masks(paths: Sequence[Path], cameras: Sequence[Camera]) -> Iterator[np.ndarray | None]:
-    """Yield for each image which of its pixels move, bool (h, w) at most 480 wide or high, in order; None
-    where too few can be followed to tell, as in photos far apart.
+def moving_masks(
+    paths: Sequence[Path], cameras: Sequence[Camera], progress: Progress = lambda *_: None
+) -> list[np.ndarray] | None:
+    """Tell which pixels of each image of a film move, bool (h, w) at most 480 wide or high: none in an image of
+    which too few can be followed to tell. None where most images are such, as photos far apart.
 
     What is not followed far enough, as it disappears or lies on the border, is as the nearest pixel that is.
     A thing that stays at rest for ``_REACH`` images before and after does not move in these; nor does what
@@ -47,26 +49,13 @@ def moving_masks(paths: Sequence[Path], cameras: Sequence[Camera]) -> Iterator[n
     Args:
         paths: images of one size, in the order of time.
         cameras: of each.
+        progress: called with images done and all.
 
     Cost: for an image of 480 x 360 about 40 ms of flow and 50 ms of geometry on one core, 200 with a lens.
     """
-    film = _Film(paths, cameras)
+    film, masks = _Film(paths, cameras), []
     for i in range(len(paths)):
-        yield film.where(_OFF, film.tracks(i, range(i - _REACH, i + _REACH + 1)))
-
-
-def film_masks(
-    paths: Sequence[Path], cameras: Sequence[Camera], progress: Progress = lambda *_: None
-) -> list[np.ndarray] | None:
-    """Return the masks of ``moving_masks``, with nothing in those that are None; None where most are.
-
-    Args:
-        paths, cameras: see ``moving_masks``.
-        progress: called with images done and all.
-    """
-    masks = []
-    for mask in moving_masks(paths, cameras):
-        masks.append(mask)
+        masks.append(film.where(_OFF, film.tracks(i, range(i - _REACH, i + _REACH + 1))))
         progress(len(masks), len(paths))
     known = [mask for mask in masks if mask is not None]
     if 2 * len(known) <= len(masks):

@@ -21,7 +21,7 @@ import pycolmap
 
 from forewarp.capture import frames, poses, scene
 from forewarp.capture.frames import NO_MASKS, TAKEN, Frames, Progress, Step
-from forewarp.capture.motion import Still, film_masks, is_fixed, resized_mask
+from forewarp.capture.motion import Still, is_fixed, moving_masks, resized_mask
 from forewarp.capture.pipeline import ABOUT, PICTURE, keep, kept, record, work_for
 from forewarp.capture.poses import Reconstruction, Search
 from forewarp.capture.sync import MOST as HEARD
@@ -624,7 +624,7 @@ def _frames_of(
             cameras |= posed
             if work.masks is None and not mine.is_fixed and posed:
                 paths = [work.folder / "pictures" / name for name in posed]
-                of_film = film_masks(paths, list(posed.values()))
+                of_film = moving_masks(paths, list(posed.values()))
                 told.add("optical flow" if of_film else None)
                 for name, mask in zip(posed, of_film or ()):
                     frames.write_mask(masks / f"{name}.png", mask)

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from forewarp.capture.frames import Frames, Progress, Source, read_mask, write_mask, write_smaller
-from forewarp.capture.motion import film_masks, resized_mask, resting_masks
+from forewarp.capture.motion import moving_masks, resized_mask, resting_masks
 from forewarp.capture.poses import Reconstruction
 from forewarp.data.images import by, common_header, read_image
 from forewarp.data.posed_video import SCALES, PosedShot, write_scene
@@ -131,7 +131,7 @@ def write(
     burnt: np.ndarray | None = None,
 ) -> dict:
     """Write the scene of all registered images, smaller copies of them, and masks of what moves: those that
-    were given, else those of ``motion.film_masks``; none of several cameras, or where these cannot tell.
+    were given, else those of ``motion.moving_masks``; none of several cameras, or where these cannot tell.
 
     Args:
         folder: to fill.
@@ -157,7 +157,7 @@ def write(
         moving_from = frames.masks_from
         masks = (read_mask(frames.masks / f"{name}.png") for name in names)
     elif is_film:
-        of_film = film_masks(paths, cameras, lambda done, total: progress(done, 2 * total))
+        of_film = moving_masks(paths, cameras, lambda done, total: progress(done, 2 * total))
         if of_film is not None:
             masks, moving_from = of_film, "optical flow against the cameras"
     resting = {}
