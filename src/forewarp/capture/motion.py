@@ -39,8 +39,8 @@ _EDGES, _RESTS, _AT_REST = 20.0, 1.0, 0.5
 def moving_masks(
     paths: Sequence[Path], cameras: Sequence[Camera], progress: Progress = lambda *_: None
 ) -> list[np.ndarray] | None:
-    """Tell which pixels of each image of a film move, bool (h, w) at most 480 wide or high: none in an image of
-    which too few can be followed to tell. None where most images are such, as photos far apart.
+    """Tell which pixels of each image of a film move, bool (h, w) at most 480 wide or high: none of an image
+    in which too few can be followed to tell. None where most images are such, as photos far apart.
 
     What is not followed far enough, as it disappears or lies on the border, is as the nearest pixel that is.
     A thing that stays at rest for ``_REACH`` images before and after does not move in these; nor does what
@@ -67,7 +67,8 @@ def resting_masks(
     paths: Sequence[Path], cameras: Sequence[Camera], which: Sequence[int]
 ) -> list[np.ndarray | None]:
     """Tell which pixels of some images rest in the whole film, bool (h, w), as far as they can be followed;
-    else see ``moving_masks``. A way of seconds is not exact to a pixel: what creeps may count as resting.
+    None for an image in which too few can. A way of seconds is not exact to a pixel: what creeps may count
+    as resting. See ``moving_masks``.
 
     Cost: for each of them the flow of all images that a pixel is followed to, 25 ms an image.
     """
