@@ -14,7 +14,7 @@ import numpy as np
 
 from forewarp.scene.camera import Camera
 from forewarp.synth.raycast import LIGHT_RADIUS, Posed, by_processes, camera_rays, shaded, surface_points
-from forewarp.synth.shapes import Material, Part, box, sphere
+from forewarp.synth.shapes import Material, Part, sphere
 from forewarp.synth.vehicle import rotation, shift
 from forewarp.synth.world import (
     BACK,
@@ -29,6 +29,7 @@ from forewarp.synth.world import (
     Specimen,
     World,
     room,
+    tiled,
 )
 
 MOVERS = ("box", "ball")
@@ -74,17 +75,13 @@ def _joints(seconds: float) -> dict[str, np.ndarray]:
 def _parts() -> list[Part]:
     """Make what moves, and before the walls a bench, a crate, a shelf and a pillar."""
     floor = ROOM_LOW[2]
-
-    def still(name: str, low, high, colors, scale: float) -> Part:
-        return Part(name, "ground", *box(low, high), Material("mosaic", colors, scale))
-
     return [
-        Part("box", "box", *box((-0.16, -0.12, 0.0), (0.16, 0.12, 0.27)), Material("mosaic", TILES, 0.06)),
+        tiled("box", "box", (-0.16, -0.12, 0.0), (0.16, 0.12, 0.27), TILES, 0.06),
         Part("ball", "ball", *sphere(RADIUS), Material("mosaic", LACQUER, 0.06), smooth=True),
-        still("bench", (-0.85, 0.0, floor), (0.85, 0.5, 0.5), STONES, 0.09),
-        still("crate", (-1.3, 0.7, floor), (-0.75, 1.2, 0.8), LACQUER, 0.11),
-        still("shelf", (-0.5, 1.45, 1.25), (0.9, 1.75, 1.35), (*TILES[:4], INK), 0.07),
-        still("pillar", (0.95, 0.9, floor), (1.2, 1.15, 2.0), (*STONES[:4], INK), 0.08),
+        tiled("bench", "ground", (-0.85, 0.0, floor), (0.85, 0.5, 0.5), STONES, 0.09),
+        tiled("crate", "ground", (-1.3, 0.7, floor), (-0.75, 1.2, 0.8), LACQUER, 0.11),
+        tiled("shelf", "ground", (-0.5, 1.45, 1.25), (0.9, 1.75, 1.35), (*TILES[:4], INK), 0.07),
+        tiled("pillar", "ground", (0.95, 0.9, floor), (1.2, 1.15, 2.0), STONES, 0.08),
     ]
 
 
@@ -136,8 +133,7 @@ def _pictures() -> list[Part]:
     made = []
     for number, (side, *place) in enumerate(PICTURES):
         colors, scale = PALETTES[number % len(PALETTES)], SMALL_TILE + 0.003 * (number % 7)
-        mosaic = Material("mosaic", colors, scale)
-        made.append(Part(f"{side}{number}", "ground", *box(*ways[side](*place)), mosaic))
+        made.append(tiled(f"{side}{number}", "ground", *ways[side](*place), colors, scale))
     return made
 
 

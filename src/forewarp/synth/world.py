@@ -73,7 +73,7 @@ def _sheet() -> list[Part]:
     ]
 
 
-def _tiled(name: str, joint: str, low, high, colors, scale: float, casts: bool = True) -> Part:
+def tiled(name: str, joint: str, low, high, colors, scale: float, casts: bool = True) -> Part:
     """Make a box between two corners (3,), in a mosaic of tiles."""
     return Part(name, joint, *box(low, high), Material("mosaic", colors, scale), casts=casts)
 
@@ -94,9 +94,9 @@ def _corner() -> list[Part]:
     """Make a floor and two walls behind the subject; they fill every image."""
     near, far, outside, floor = -1.1, 5.0, -1.1 - 0.1, GROUND - 0.0702
     return [
-        _tiled("floor", "room", (outside, outside, floor - 0.1), (far, far, floor), STONES, 0.22, False),
-        _tiled("wall_x", "room", (outside, outside, floor), (near, far, far), TILES, 0.22, False),
-        _tiled("wall_y", "room", (near, outside, floor), (far, near, far), LACQUER, 0.22, False),
+        tiled("floor", "room", (outside, outside, floor - 0.1), (far, far, floor), STONES, 0.22, False),
+        tiled("wall_x", "room", (outside, outside, floor), (near, far, far), TILES, 0.22, False),
+        tiled("wall_y", "room", (near, outside, floor), (far, near, far), LACQUER, 0.22, False),
     ]
 
 
@@ -121,12 +121,12 @@ BLOCKS = {
 
 def _blocks() -> list[Part]:
     """Put four blocks around a pillar on a plate, which each come or go."""
-    pillar = _tiled("pillar", "ground", (-0.14, -0.14, 0.0), (0.14, 0.14, 0.7), STONES, 0.14)
+    pillar = tiled("pillar", "ground", (-0.14, -0.14, 0.0), (0.14, 0.14, 0.7), STONES, 0.14)
     parts = [_plate(Material("mosaic", TILES, 0.2)), pillar]
     for name, (_, (x, y), colors) in BLOCKS.items():
         middle = 0.35 * np.array([x, y, 0.0])
         low, high = middle - (0.2, 0.2, 0.0), middle + (0.2, 0.2, 0.42)
-        parts.append(_tiled(name, "ground", low, high, colors, 0.13))
+        parts.append(tiled(name, "ground", low, high, colors, 0.13))
     return parts
 
 
@@ -164,7 +164,7 @@ def room(low=ROOM_LOW, high=ROOM_HIGH, fineness: float = 1.0) -> list[Part]:
         ("front", (x0 - t, y0 - t, z0), (x1 + t, y0, z1), BACK, 0.34),
         ("back", (x0 - t, y1, z0), (x1 + t, y1 + t, z1), BACK, 0.34),
     )
-    return [_tiled(name, "ground", *box, scale / fineness, casts=False) for name, *box, scale in sides]
+    return [tiled(name, "ground", *box, scale / fineness, casts=False) for name, *box, scale in sides]
 
 
 SPECIMENS = {
