@@ -45,6 +45,9 @@ _WORSE = 3.0  # times the median error of all cameras, from which on one is name
 _HEARD = ("certainty", "residual", "agreeing")  # what is told of a camera's ``Synchrony``
 
 
+Offsets = str | float | Sequence[float] | Mapping[str, float] | None  # see ``offsets_of``
+
+
 @dataclass(frozen=True)
 class Recording:
     """What one camera of a rig took: a video at ``path``, or the ``images`` of a folder; ``stamps`` are their
@@ -169,11 +172,7 @@ def _refuse_unknown(key: str, names: Sequence[str], there: Sequence[str]) -> Non
 
 
 def offsets_of(
-    films: Sequence[Recording],
-    wanted: str | float | Sequence[float] | Mapping[str, float] | None,
-    everyone: Sequence[str],
-    step: Step,
-    is_timed: bool = True,
+    films: Sequence[Recording], wanted: Offsets, everyone: Sequence[str], step: Step, is_timed: bool = True
 ) -> tuple[np.ndarray, Synchrony | None, str]:
     """Find when each film began, in seconds.
 
@@ -348,7 +347,7 @@ def capture_rig(
     step: Step,
     *,
     masks: Path | None = None,
-    offsets: str | float | Sequence[float] | Mapping[str, float] | None = None,
+    offsets: Offsets = None,
     without: Sequence[str] = (),
     fixed: bool | None = None,
     rate: float | None = None,
