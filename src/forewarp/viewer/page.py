@@ -282,18 +282,21 @@ class Page:
             keys[:] = states
             tell(f"{len(keys)} key views")
 
+        def show_progress(done: int, total: int) -> None:
+            tell(f"{done} of {total} images")
+
         def make_video(_: viser.GuiEvent) -> None:
             make.disabled = True
-            try:
-                self.save_video(list(keys), float(seconds.value), tell)
-            finally:
-                make.disabled = False
+            with told_if_it_fails("video", tell):  # also while an image is rendered
+                length = float(seconds.value)
+                file = self.session.write_video(self.folder, list(keys), length, show_progress)
+                tell(f"written: {file}")
+                self.client.send_file_download(file.name, file.read_bytes(), save_immediately=True)
+            make.disabled = False
 
         on_press(add, lambda: set_keys(*keys, self.session.state))
         on_press(clear, set_keys)
         make.on_click(make_video)  # in a thread of its own, as it waits
-
-    # What waits for images.
 
     def save_screenshot(self) -> None:
         """Send the image as a file, or say why there is none."""
@@ -308,17 +311,6 @@ class Page:
             names = "-".join(renderer.name for renderer in self.viewer.renderers)
             name = f"{self.viewer.scene.name}-{names}-{state.channel}-{state.time:.3f}.png"
             self.client.send_file_download(name, png_bytes(image), save_immediately=True)
-
-    def save_video(self, keys: list, seconds: float, tell: Callable[[str], None]) -> None:
-        """Write and send a video through key views, or say why there is none."""
-
-        def progress(done: int, total: int) -> None:
-            tell(f"{done} of {total} images")
-
-        with told_if_it_fails("video", tell):  # also while an image is rendered
-            file = self.session.write_video(self.folder, keys, seconds, progress)
-            tell(f"written: {file}")
-            self.client.send_file_download(file.name, file.read_bytes(), save_immediately=True)
 
 
 def fitted_fov(camera: Camera, width: float, height: float) -> float:
