@@ -22,7 +22,7 @@ from forewarp.scene.camera import Camera, Lens, look_at
 from forewarp.scene.frame import Truth
 from forewarp.synth.raycast import Hits, Posed, camera_rays, light_points, render_all, surface_points
 from forewarp.synth.vehicle import MOTIONS
-from forewarp.synth.world import ELEVATION, SUBJECTS, World
+from forewarp.synth.world import AROUND, ELEVATION, SUBJECTS, Range, World
 
 UP = torch.tensor([0.0, 0.0, 1.0])
 POINTS = 4000  # of the trajectories
@@ -238,11 +238,7 @@ def orbit_camera(azimuth: float, sine: float, size: int) -> Camera:
 
 
 def random_cameras(
-    count: int,
-    size: int,
-    rng: np.random.Generator,
-    azimuth: tuple[float, float] = (0.0, 360.0),
-    rise: tuple[float, float] = ELEVATION,
+    count: int, size: int, rng: np.random.Generator, azimuth: Range = AROUND, rise: Range = ELEVATION
 ) -> list[Camera]:
     """Draw cameras uniformly by area on the upper half of the sphere, or a part of it.
 

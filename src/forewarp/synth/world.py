@@ -24,8 +24,10 @@ TILES = ((0.62, 0.44, 0.60), (0.88, 0.78, 0.72), (0.42, 0.32, 0.50), (0.84, 0.80
 LACQUER = ((0.58, 0.16, 0.18), (0.20, 0.30, 0.52), (0.30, 0.46, 0.26), (0.62, 0.48, 0.14), INK)
 GLOSSY, MATTE = Material("mosaic", LACQUER, 0.16, gloss=0.75, shine=5.0), Material("mosaic", STONES, 0.16)
 LIGHT_AT = np.array([2.2, -2.6, 4.6])
-# Least and greatest sine of a camera's elevation: neither along the slab nor straight from above.
-ELEVATION = (0.06, 0.96)
+Range = tuple[float, float]
+# Least and greatest azimuth of a camera, in degrees, and sine of its elevation: neither along the slab nor
+# straight from above.
+AROUND, ELEVATION = (0.0, 360.0), (0.06, 0.96)
 
 # World units about the ground joint, whose z = 0 is the top of the slab; the slab stands on the floor.
 ROOM_LOW, ROOM_HIGH = (-2.3, -3.7, -0.0702), (2.3, 1.75, 2.7)
@@ -54,8 +56,8 @@ class Specimen:
     extra: Callable[[], list[Part]] = list
     light: Callable[[float], np.ndarray] = lambda time: LIGHT_AT
     absent: Callable[[float], Collection[str]] = lambda time: ()
-    azimuth: tuple[float, float] = (0.0, 360.0)
-    rise: tuple[float, float] = ELEVATION
+    azimuth: Range = AROUND
+    rise: Range = ELEVATION
 
 
 def _band(time: float) -> dict[str, np.ndarray]:
