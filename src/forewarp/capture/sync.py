@@ -57,7 +57,7 @@ def is_silent(sound: np.ndarray) -> bool:
     return not len(sound) or float(np.abs(sound).max()) < _SILENT
 
 
-def synchronise(sounds: Sequence[np.ndarray], progress: Progress | None = None) -> Synchrony:
+def synchronise(sounds: Sequence[np.ndarray], progress: Progress = lambda *_: None) -> Synchrony:
     """Find when each of at least two films began.
 
     Args:
@@ -76,8 +76,7 @@ def synchronise(sounds: Sequence[np.ndarray], progress: Progress | None = None) 
     votes, pairs = {}, list(combinations(range(len(sounds)), 2))
     for done, (i, j) in enumerate(pairs, 1):
         votes[i, j] = _lag(waves[i], waves[j], size, onsets[i], onsets[j], frames)
-        if progress is not None:
-            progress(done, len(pairs))
+        progress(done, len(pairs))
     return agreed(votes, len(sounds))
 
 
