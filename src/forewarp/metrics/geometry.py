@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from forewarp.metrics.registry import THRESHOLDS
+from forewarp.ops.backend import check_shapes
 
 MOVING_FRACTION = 0.02
 
@@ -33,10 +34,9 @@ def depth_delta(
     >>> depth_delta(torch.tensor([[1.0, 1.2, 9.0]]), torch.tensor([[1.0, 1.0, 0.0]]), thresholds=(1.1, 1.25))
     (0.5, 1.0)
     """
-    shape = tuple(truth.shape)
-    for name, image in (("depth", prediction), ("foreground", foreground)):
-        if image is not None and image.shape != shape:
-            raise ValueError(f"{name}: expected the true depth's shape {shape}, but got {tuple(image.shape)}")
+    check_shapes("truth (H, W), depth (H, W)", truth, prediction)
+    if foreground is not None:
+        check_shapes("truth (H, W), foreground (H, W)", truth, foreground)
     if min(thresholds, default=0) <= 1:
         raise ValueError(f"thresholds: expected ratios above 1, but got {thresholds}")
     prediction, truth = prediction.detach().cpu().double(), truth.cpu().double()
@@ -80,16 +80,12 @@ def end_point_error(
     >>> scores["epe_moving"], scores["epe_still"], scores["motion_mean"]
     (1.0, 0.0, 1.0)
     """
-    shape = tuple(truth.shape)
-    if len(shape) != 3 or shape[-1] != 3 or shape[0] < 1 or shape[1] < 2:
-        raise ValueError(f"true points: expected (N, T, 3) with N >= 1 and T >= 2, but got shape {shape}")
-    if predicted.shape != shape:
-        raise ValueError(f"predicted points: expected shape {shape}, but got {tuple(predicted.shape)}")
-    for name, points in (("predicted points", predicted), ("true points", truth)):
-        if bad := int((~torch.isfinite(points)).sum()):
-            got = f"{bad} of {points.numel()} NaN or infinite"
-            raise ValueError(f"{name}: expected finite places, but got {got}")
+    check_shapes("true_points (N, T, 3), predicted_points (N, T, 3)", truth, predicted)
     predicted, truth = predicted.detach().cpu().double(), truth.cpu().double()
+    wrong = int((~torch.isfinite(predicted - truth)).sum())
+    if len(truth) < 1 or truth.shape[1] < 2 or wrong:
+        got = f"shape {tuple(truth.shape)}, {wrong} NaN or infinite"
+        raise ValueError(f"points: expected finite (N, T, 3) with N >= 1 and T >= 2, but got {got}")
     if moving_threshold is None:
         canonical = truth[:, 0]
         moving_threshold = MOVING_FRACTION * float((canonical.amax(0) - canonical.amin(0)).norm())

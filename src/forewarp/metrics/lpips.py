@@ -196,17 +196,13 @@ def _load_backbone(features: nn.Sequential, file: Path, net: str) -> None:
     what = f"weights of {net}'s features"
     try:
         stored = torch.load(file, map_location="cpu", weights_only=True)
-    except (OSError, RuntimeError, EOFError, pickle.UnpicklingError) as error:
+        state, wanted = {key.removeprefix("features."): stored[key] for key in stored}, features.state_dict()
+        features.load_state_dict({key: state[key] for key in wanted if key in state})
+    except (OSError, EOFError, pickle.UnpicklingError) as error:
         raise ValueError(f"{file}: expected {what}, but got {type(error).__name__} on reading") from error
-    if not isinstance(stored, dict):
-        raise ValueError(f"{file}: expected {what}, but got a {type(stored).__name__}")
-    state = {key.removeprefix("features."): value for key, value in stored.items()}
-    for key, parameter in features.state_dict().items():
-        if key not in state or state[key].shape != parameter.shape:
-            expected = f"{what} with {key!r} of shape {tuple(parameter.shape)}"
-            got = f"shape {tuple(state[key].shape)}" if key in state else "none"
-            raise ValueError(f"{file}: expected {expected}, but got {got}")
-    features.load_state_dict({key: state[key] for key in features.state_dict()})
+    except (RuntimeError, AttributeError, TypeError) as error:
+        got = " ".join(str(error).split())
+        raise ValueError(f"{file}: expected {what}, but got others: {got}") from error
 
 
 def heads_of(net: str) -> list[Tensor]:
