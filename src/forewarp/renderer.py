@@ -69,6 +69,7 @@ def in_chunks(render: Callable[[slice], Rendering], count: int, chunk: int) -> R
     return Rendering.joined([render(slice(begin, begin + chunk)) for begin in range(0, count, chunk)])
 
 
+@dataclass(kw_only=True, eq=False)
 class Renderer:
     """March rays through occupied cells and composite the samples.
 
@@ -82,21 +83,20 @@ class Renderer:
             by the CPU kernel); 0: never.
     """
 
-    def __init__(
-        self, *, step: float = 0.5, color_threshold: float = 1e-4, early_stop_eps: float = 1e-4
-    ) -> None:
-        if not step > 0 or not 0 <= color_threshold < 1 or not 0 <= early_stop_eps < 1:
+    step: float = 0.5
+    color_threshold: float = 1e-4
+    early_stop_eps: float = 1e-4
+
+    def __post_init__(self) -> None:
+        if not self.step > 0 or not 0 <= self.color_threshold < 1 or not 0 <= self.early_stop_eps < 1:
             raise ValueError(
                 "renderer: expected step > 0 and 0 <= color_threshold < 1 and 0 <= early_stop_eps < 1, "
-                f"but got {step=}, {color_threshold=}, {early_stop_eps=}"
+                f"but got {self}"
             )
-        self.step, self.color_threshold, self.early_stop_eps = step, color_threshold, early_stop_eps
 
     def with_threshold(self, color_threshold: float | None) -> Renderer:
         """Return a renderer with another ``color_threshold``; this one for None."""
-        if color_threshold is None:
-            return self
-        return Renderer(step=self.step, color_threshold=color_threshold, early_stop_eps=self.early_stop_eps)
+        return self if color_threshold is None else replace(self, color_threshold=color_threshold)
 
     def __call__(
         self,
