@@ -163,15 +163,8 @@ def march(
     _check_march(*rays)
     if not use_numba(origins):
         return march_reference(*rays)
-    from forewarp.ops.kernels import voxels as kernels
-
-    counts, firsts = torch.zeros(2, len(origins), dtype=torch.int64).unbind()
-    common = (*_march_arrays(*rays), *arrays(counts, firsts))
-    kernels.march(*common, *arrays(counts[:0], counts[:0], origins[:0, 0]))
-    starts, total = counts.cumsum(0) - counts, int(counts.sum())
-    ray_ids, distances = counts.new_empty(total), origins.new_empty(total)
-    kernels.march(*common, *arrays(starts, ray_ids, distances))
-    return ray_ids, distances
+    found = _marched(rays, None, None, 0.0, 0.0, 0.0, 0.0, 0.0)
+    return found.ray_ids, found.distances
 
 
 def _check_march(origins, directions, near, far, step, cells, jitter) -> None:
@@ -262,16 +255,24 @@ def trace(
     _check_march(*rays)
     sizes = {axis: n + 1 for axis, n in zip("XYZ", cells.shape)}
     check_shapes("raw (M), index (X, Y, Z)", raw, index, **sizes)
+    return _marched(rays, raw, index, fill, shift, scale, early_stop_eps, threshold)
+
+
+def _marched(rays: tuple, raw: Tensor | None, index: Tensor | None, *numbers: float) -> Traced:
+    """Call the kernel twice: to count each ray's samples, and to write them. See ``trace``; a ``raw`` of None
+    has no density, and each sample a weight of 1.
+    """
     from forewarp.ops.kernels import voxels as kernels
 
+    origins, *_ = rays
     sums = torch.zeros(len(origins), 4, dtype=torch.float64)
     read, counts, firsts = torch.zeros(3, len(origins), dtype=torch.int64).unbind()
-    field = (*arrays(raw, index), *map(float, (fill, shift, scale, early_stop_eps, threshold)))
-    common = (*_march_arrays(*rays), *field, *arrays(sums, read, counts, firsts))
-    kernels.trace(*common, *arrays(counts[:0], counts[:0], origins[:0, 0], origins[:0, 0]))
+    field = (None, None) if raw is None else arrays(raw, index)
+    common = (*_march_arrays(*rays), *field, *map(float, numbers), *arrays(sums, read, counts, firsts))
+    kernels.march(*common, *arrays(counts[:0], counts[:0], origins[:0, 0], origins[:0, 0]))
     starts, total = counts.cumsum(0) - counts, int(counts.sum())
     ids, distances, weights = counts.new_empty(total), *origins.new_empty(2, total).unbind()
-    kernels.trace(*common, *arrays(starts, ids, distances, weights))
+    kernels.march(*common, *arrays(starts, ids, distances, weights))
     opacity, distance, transmittance, _ = sums.to(origins.dtype).unbind(-1)
     return Traced(opacity, distance, transmittance, ids, distances, weights, int(read.sum()))
 

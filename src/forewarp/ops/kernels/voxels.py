@@ -234,37 +234,6 @@ def _seek(o, d, k, near, step, jitter, end, cells, reach, block):
     return k, t
 
 
-@njit(parallel=True, cache=True)
-def march(
-    origins, directions, near, far, step, jitter, cells, reach, bounds, block, counts, firsts, starts,
-    ray_ids, distances,
-):  # fmt: skip
-    """Count each ray's samples and note its first step if ``starts`` is empty; else write the samples from
-    ``starts[r]`` on.
-    """
-    counting = starts.shape[0] == 0
-    for r in prange(origins.shape[0]):
-        o, d = origins[r], directions[r]
-        t0, t1 = _span(o, d, near, far, bounds)
-        if t0 > t1 or (not counting and counts[r] == 0):
-            continue
-        k = _first(t0, near, step, jitter[r]) if counting else firsts[r]
-        found, t = 0, near
-        while counting or found < counts[r]:
-            k, t = _seek(o, d, k, near, step, jitter[r], t1, cells, reach, block)
-            if not t <= t1:
-                break
-            if not counting:
-                ray_ids[starts[r] + found] = r
-                distances[starts[r] + found] = t
-            elif found == 0:
-                firsts[r] = k
-            found += 1
-            k += 1
-        if counting:
-            counts[r] = found
-
-
 @njit(cache=True)
 def pool_blocks(cells, reach, block, bounds):
     """Fill ``reach``, the chessboard distance of each block (``block`` cells a side) to the nearest occupied
@@ -314,13 +283,15 @@ def _raw(raw, index, fill, x, y, z):
 
 
 @njit(parallel=True, cache=True)
-def trace(
+def march(
     origins, directions, near, far, step, jitter, cells, reach, bounds, block, raw, index, fill,
     shift, scale, early_stop_eps, threshold, sums, read, counts, firsts, starts, ray_ids, distances, weights,
 ):  # fmt: skip
     """If ``starts`` is empty, compute each ray's ``sums`` (opacity, distance, transmittance), the number of
     samples read, and of those above the threshold the number, the first step and the transmittance before it
     (last column of ``sums``). Else write the samples above the threshold from ``starts[r]`` on.
+
+    Where ``raw`` is None, nothing is read: each sample weighs 1 and hides nothing.
     """
     counting = starts.shape[0] == 0
     for r in prange(origins.shape[0]):
@@ -337,10 +308,12 @@ def trace(
             k, t = _seek(o, d, k, near, step, jitter[r], t1, cells, reach, block)
             if not t <= t1:
                 break
-            v = _raw(raw, index, fill, o[0] + t * d[0], o[1] + t * d[1], o[2] + t * d[2]) + shift
-            # The optical depth of a step: softplus(raw + shift) * scale.
-            x = min((v if v > 20 else np.log1p(np.exp(v))) * scale, 80.0)
-            weight = through * -np.expm1(-x)
+            weight, passed = 1.0, 1.0
+            if raw is not None:
+                v = _raw(raw, index, fill, o[0] + t * d[0], o[1] + t * d[1], o[2] + t * d[2]) + shift
+                # The optical depth of a step: softplus(raw + shift) * scale.
+                x = min((v if v > 20 else np.log1p(np.exp(v))) * scale, 80.0)
+                weight, passed = through * -np.expm1(-x), np.exp(-x)
             if weight > threshold:
                 if not counting:
                     ray_ids[starts[r] + found] = r
@@ -354,7 +327,7 @@ def trace(
                 opacity += weight
                 distance += weight * t
                 read[r] += 1
-            through *= np.exp(-x)
+            through *= passed
             k += 1
         if counting:
             sums[r, 0], sums[r, 1], sums[r, 2] = opacity, distance, through
