@@ -9,6 +9,7 @@ Functions that take ``builder`` write LLVM code; the others are called from kern
 
 from __future__ import annotations
 
+import inspect
 import math
 import operator
 
@@ -134,6 +135,27 @@ _operator(operator.truediv, "fdiv")
 # Values ----------------------------------------------------------------------------------------------------
 
 
+def _of_vectors(result=None):
+    """Make an intrinsic of a function that writes code: it gets the builder, and vectors, to which numbers
+    among its arguments are widened. ``result``: the type of what it gives; None: a vector as wide.
+    """
+
+    def make(write):
+        def define(typing, *kinds):
+            width = _width(kinds)
+
+            def code(context, builder, sig, args):
+                return write(builder, *(_as_lanes(builder, *pair, width) for pair in zip(args, sig.args)))
+
+            return None if width is None else ((result or LanesType(width))(*kinds), code)
+
+        define.__name__, define.__doc__ = write.__name__, write.__doc__
+        define.__signature__ = inspect.signature(write)  # by which Numba counts arguments
+        return intrinsic(define)
+
+    return make
+
+
 @intrinsic
 def lanes(typing, value):
     """A number on all pixels of a tile."""
@@ -158,86 +180,54 @@ def narrow_columns(typing):
     return SUMS(), lambda *_: _constant(NARROW, ((i % ROW) + 0.5 for i in range(NARROW)))
 
 
-@intrinsic
-def widened(typing, a):
+@_of_vectors(TILE)
+def widened(builder, a):
     """The 64 pixels of a tile whose rows come in four pairs alike: ``a`` is one pair, 2 rows of 8."""
-    order = [*range(NARROW)] * (WIDE // NARROW)
-    return TILE(a), lambda _, builder, sig, args: _shuffled(builder, args[0], args[0], order)
+    return _shuffled(builder, a, a, [*range(NARROW)] * (WIDE // NARROW))
 
 
-@intrinsic
-def fma(typing, a, b, c):
+@_of_vectors()
+def fma(builder, a, b, c):
     """``a b + c``, in one instruction where the CPU has it."""
-    width = _width((a, b, c))
-
-    def code(context, builder, sig, args):
-        vectors = (_as_lanes(builder, value, kind, width) for value, kind in zip(args, sig.args))
-        return _llvm(builder, "fmuladd", *vectors)
-
-    return LanesType(width)(a, b, c), code
+    return _llvm(builder, "fmuladd", a, b, c)
 
 
-@intrinsic
-def root(typing, a):
+@_of_vectors()
+def root(builder, a):
     """The square root."""
-    return a(a), lambda _, builder, sig, args: _llvm(builder, "sqrt", args[0])
+    return _llvm(builder, "sqrt", a)
 
 
-@intrinsic
-def where_above(typing, a, least, value):
+@_of_vectors()
+def where_above(builder, a, least, value):
     """``value`` where ``a > least``, 0 elsewhere, also where ``a`` is NaN."""
-
-    def code(context, builder, sig, args):
-        mark = _as_lanes(builder, args[1], sig.args[1], a.width)
-        above = builder.fcmp_ordered(">", args[0], mark)
-        return builder.select(above, args[2], _constant(a.width, 0.0))
-
-    return value(a, least, value), code
+    return builder.select(builder.fcmp_ordered(">", a, least), value, _constant(a.type.count, 0.0))
 
 
-@intrinsic
-def any_above(typing, a, least):
+@_of_vectors(types.boolean)
+def any_above(builder, a, least):
     """Whether ``a > least`` anywhere."""
-
-    def code(context, builder, sig, args):
-        mark = _as_lanes(builder, args[1], sig.args[1], a.width)
-        bits = builder.bitcast(builder.fcmp_ordered(">", args[0], mark), ir.IntType(a.width))
-        return builder.icmp_unsigned("!=", bits, ir.Constant(bits.type, 0))
-
-    return types.boolean(a, least), code
+    bits = builder.bitcast(builder.fcmp_ordered(">", a, least), ir.IntType(a.type.count))
+    return builder.icmp_unsigned("!=", bits, ir.Constant(bits.type, 0))
 
 
-def _chosen(a, b, sign: str):
-    """Take ``a`` where it compares so with ``b``, else ``b``."""
-
-    def code(context, builder, sig, args):
-        x, y = (_as_lanes(builder, v, k, NARROW) for v, k in zip(args, sig.args))
-        return builder.select(builder.fcmp_ordered(sign, x, y), x, y)
-
-    return SUMS(a, b), code
+@_of_vectors()
+def maximum(builder, a, b):
+    """The larger of two vectors, or of one and a number; ``b`` where either is NaN."""
+    return builder.select(builder.fcmp_ordered(">", a, b), a, b)
 
 
-@intrinsic
-def maximum(typing, a, b):
-    """The larger of two vectors of 16 numbers, or of one and a number; ``b`` where either is NaN."""
-    return _chosen(a, b, ">")
+@_of_vectors()
+def minimum(builder, a, b):
+    """The smaller of two vectors, or of one and a number; ``b`` where either is NaN."""
+    return builder.select(builder.fcmp_ordered("<", a, b), a, b)
 
 
-@intrinsic
-def minimum(typing, a, b):
-    """The smaller of two vectors of 16 numbers, or of one and a number; ``b`` where either is NaN."""
-    return _chosen(a, b, "<")
-
-
-@intrinsic
-def not_zero(typing, a):
+@_of_vectors(types.uint64)
+def not_zero(builder, a):
     """Which of 16 numbers are not 0, NaN among them: as bits of a uint64, the first the lowest."""
-
-    def code(context, builder, sig, args):
-        marks = builder.fcmp_unordered("!=", args[0], _constant(NARROW, 0.0))
-        return builder.zext(builder.bitcast(marks, ir.IntType(NARROW)), ir.IntType(64))
-
-    return types.uint64(SUMS), code
+    marks = builder.fcmp_unordered("!=", a, _constant(NARROW, 0.0))
+    return builder.zext(builder.bitcast(marks, ir.IntType(NARROW)), ir.IntType(64))
 
 
 @intrinsic
@@ -251,88 +241,68 @@ def where_bits(typing, bits, a, b):
     return SUMS(types.uint64, SUMS, SUMS), code
 
 
-@intrinsic
-def exp_down(typing, a):
+@_of_vectors()
+def exp_down(builder, a):
     """``exp(a)`` of ``-6 <= a <= 0`` to 1e-6; of other numbers it is anything.
 
     The polynomial is of ``exp(a / 8)``, whose eighth power is taken by squaring thrice.
     """
-
-    def code(context, builder, sig, args):
-        value = _polynomial(builder, args[0], _EXP_DOWN)
-        for _ in range(3):
-            value = builder.fmul(value, value, flags=FLAGS)
-        return value
-
-    return a(a), code
+    value = _polynomial(builder, a, _EXP_DOWN)
+    for _ in range(3):
+        value = builder.fmul(value, value, flags=FLAGS)
+    return value
 
 
-@intrinsic
-def exp(typing, a):
-    """``exp(a)`` to 1e-7, of ``a`` between -87 and 88; beyond, of those. NaN stays NaN."""
-
-    def code(context, builder, sig, args):
-        width, x = a.width, args[0]
-        for sign, limit in (("<", _LOW), (">", _HIGH)):
-            mark = _constant(width, limit)
-            x = builder.select(builder.fcmp_ordered(sign, x, mark), mark, x)
-        times = _llvm(builder, "rint", builder.fmul(x, _constant(width, 1 / math.log(2))))
-        for part in _LN2:
-            x = _llvm(builder, "fmuladd", times, _constant(width, -part), x)
-        power = builder.add(builder.fptosi(times, ir.VectorType(INT, width)), _whole(width, _BIAS))
-        power = builder.bitcast(builder.shl(power, _whole(width, _MANTISSA)), x.type)
-        return builder.fmul(_polynomial(builder, x, _EXP), power, flags=FLAGS)
-
-    return a(a), code
+@_of_vectors()
+def exp(builder, x):
+    """``exp(x)`` to 1e-7, of ``x`` between -87 and 88; beyond, of those. NaN stays NaN."""
+    width = x.type.count
+    for sign, limit in (("<", _LOW), (">", _HIGH)):
+        mark = _constant(width, limit)
+        x = builder.select(builder.fcmp_ordered(sign, x, mark), mark, x)
+    times = _llvm(builder, "rint", builder.fmul(x, _constant(width, 1 / math.log(2))))
+    for part in _LN2:
+        x = _llvm(builder, "fmuladd", times, _constant(width, -part), x)
+    power = builder.add(builder.fptosi(times, ir.VectorType(INT, width)), _whole(width, _BIAS))
+    power = builder.bitcast(builder.shl(power, _whole(width, _MANTISSA)), x.type)
+    return builder.fmul(_polynomial(builder, x, _EXP), power, flags=FLAGS)
 
 
-@intrinsic
-def log(typing, a):
+@_of_vectors()
+def log(builder, a):
     """``log(a)`` to 1e-7, of ``a`` not below 1e-37."""
-
-    def code(context, builder, sig, args):
-        width, kind = a.width, args[0].type
-        bits = builder.bitcast(args[0], ir.VectorType(INT, width))
-        # What is added makes the mantissa lie between the roots of 1/2 and of 2.
-        bits = builder.add(bits, _whole(width, 0x3F800000 - _ROOT_HALF))
-        power = builder.sub(builder.ashr(bits, _whole(width, _MANTISSA)), _whole(width, _BIAS))
-        rest = builder.and_(bits, _whole(width, (1 << _MANTISSA) - 1))
-        rest = builder.bitcast(builder.add(rest, _whole(width, _ROOT_HALF)), kind)
-        f = builder.fsub(rest, _constant(width, 1.0))
-        value = builder.fmul(_polynomial(builder, f, _LOG), f)
-        value = builder.fmul(builder.fadd(value, _constant(width, -0.5)), builder.fmul(f, f))
-        times = builder.sitofp(power, kind)
-        value = builder.fadd(_llvm(builder, "fmuladd", times, _constant(width, _LN2[1]), value), f)
-        return _llvm(builder, "fmuladd", times, _constant(width, _LN2[0]), value)
-
-    return a(a), code
+    width, kind = a.type.count, a.type
+    bits = builder.bitcast(a, ir.VectorType(INT, width))
+    # What is added makes the mantissa lie between the roots of 1/2 and of 2.
+    bits = builder.add(bits, _whole(width, 0x3F800000 - _ROOT_HALF))
+    power = builder.sub(builder.ashr(bits, _whole(width, _MANTISSA)), _whole(width, _BIAS))
+    rest = builder.and_(bits, _whole(width, (1 << _MANTISSA) - 1))
+    rest = builder.bitcast(builder.add(rest, _whole(width, _ROOT_HALF)), kind)
+    f = builder.fsub(rest, _constant(width, 1.0))
+    value = builder.fmul(_polynomial(builder, f, _LOG), f)
+    value = builder.fmul(builder.fadd(value, _constant(width, -0.5)), builder.fmul(f, f))
+    times = builder.sitofp(power, kind)
+    value = builder.fadd(_llvm(builder, "fmuladd", times, _constant(width, _LN2[1]), value), f)
+    return _llvm(builder, "fmuladd", times, _constant(width, _LN2[0]), value)
 
 
-@intrinsic
-def fold(typing, a):
+@_of_vectors(SUMS)
+def fold(builder, a):
     """The sum of a tile's four pairs of rows: 16 numbers, 2 rows of 8."""
-
-    def code(context, builder, sig, args):
-        parts = [_shuffled(builder, args[0], args[0], range(i, i + NARROW)) for i in range(0, WIDE, NARROW)]
-        first, second = (builder.fadd(*pair, flags=FLAGS) for pair in (parts[:2], parts[2:]))
-        return builder.fadd(first, second, flags=FLAGS)
-
-    return SUMS(a), code
+    parts = [_shuffled(builder, a, a, range(i, i + NARROW)) for i in range(0, WIDE, NARROW)]
+    first, second = (builder.fadd(*pair, flags=FLAGS) for pair in (parts[:2], parts[2:]))
+    return builder.fadd(first, second, flags=FLAGS)
 
 
-@intrinsic
-def total(typing, a):
+@_of_vectors(types.float32)
+def total(builder, value):
     """The sum of all, float32."""
-
-    def code(context, builder, sig, args):
-        value, width = args[0], a.width
-        while width > 1:
-            width //= 2
-            low, high = (_shuffled(builder, value, value, range(i, i + width)) for i in (0, width))
-            value = builder.fadd(low, high, flags=FLAGS)
-        return builder.extract_element(value, ir.Constant(INT, 0))
-
-    return types.float32(a), code
+    width = value.type.count
+    while width > 1:
+        width //= 2
+        low, high = (_shuffled(builder, value, value, range(i, i + width)) for i in (0, width))
+        value = builder.fadd(low, high, flags=FLAGS)
+    return builder.extract_element(value, ir.Constant(INT, 0))
 
 
 # Memory ----------------------------------------------------------------------------------------------------
@@ -358,17 +328,6 @@ def _read(kind, array):
     return kind(array, types.intp), code
 
 
-def _write(array, value):
-    """Write a vector to ``array[row]``."""
-
-    def code(context, builder, sig, args):
-        pointer = _at(context, builder, sig.args[0], *args[:2], width=value.width)
-        builder.store(args[2], pointer, align=4)
-        return context.get_dummy_value()
-
-    return types.none(array, types.intp, value), code
-
-
 @intrinsic
 def get(typing, array, row):
     """Read 64 numbers from ``array[row, :64]``."""
@@ -384,7 +343,13 @@ def get_row(typing, array, row):
 @intrinsic
 def put_row(typing, array, row, value):
     """Write a vector to ``array[row, :width]``, or ``array[row : row + width]``, also of ``floats_at``."""
-    return _write(array, value)
+
+    def code(context, builder, sig, args):
+        pointer = _at(context, builder, sig.args[0], *args[:2], width=value.width)
+        builder.store(args[2], pointer, align=4)
+        return context.get_dummy_value()
+
+    return types.none(array, types.intp, value), code
 
 
 def _combined(builder, a, b, size: int):
