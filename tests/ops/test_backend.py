@@ -70,7 +70,7 @@ REFUSED = {
         (partial(see, jitter=zeros(3)), "jitter: expected shape"),
         (partial(stratified, zeros(1), zeros(1), 1), "expected count >= 2, but got 1"),
         (partial(by_importance, zeros(1, 1), zeros(1, 0), 4), "expected a bin"),
-        (partial(by_importance, zeros(1, 3), zeros(1, 2), 4, floor=0.0), "floor > 0"),
+        (partial(by_importance, zeros(1, 3), zeros(1, 2), 0), "but got 2 and count=0"),
         (partial(dense_weights, zeros(3)), r"optical: expected shape \(R, S\), but got \(3,\)"),
     ],
     "splat": [

@@ -14,6 +14,7 @@ from forewarp.ops.splat import average_splat
 
 _BLOCK = 4  # side, in cells, of the blocks of a coarse occupancy map, by which rays skip empty space
 _MARGIN = 1e-3  # cells
+_FLOOR = 1e-5  # of the weight of a bin, so that every bin can be drawn
 
 # Sample distances ------------------------------------------------------------------------------------------
 
@@ -54,7 +55,7 @@ def midpoints(depths: Tensor) -> Tensor:
 
 @torch.no_grad()
 def by_importance(
-    edges: Tensor, weights: Tensor, count: int, generator: torch.Generator | None = None, floor: float = 1e-5
+    edges: Tensor, weights: Tensor, count: int, generator: torch.Generator | None = None
 ) -> Tensor:
     """Importance sampling (NeRF): draw ``count`` distances from a piecewise constant density.
 
@@ -63,10 +64,9 @@ def by_importance(
 
     Args:
         edges: (R, B + 1) of the bins, ascending.
-        weights: (R, B) >= 0 of the bins, not normalised.
+        weights: (R, B) >= 0 of the bins, not normalised; 1e-5 is added, so that every bin can be drawn.
         count: S >= 1.
         generator: draws the uniform numbers; None: take them evenly from 0 to 1.
-        floor: above 0, added to every weight, so that every bin can be drawn.
 
     Returns:
         (R, S), ascending without a generator.
@@ -77,12 +77,9 @@ def by_importance(
     tensor([[0.0000, 0.5000, 1.0000, 2.0000, 3.0000]])
     """
     check_shapes("edges (R, E), weights (R, B)", edges, weights, B=edges.shape[-1] - 1)
-    if weights.shape[1] < 1 or count < 1 or not floor > 0:
-        raise ValueError(
-            f"by_importance: expected a bin, count >= 1 and floor > 0, but got {weights.shape[1]} bins, "
-            f"{count=}, {floor=}"
-        )
-    ends = (weights + floor).cumsum(1)
+    if weights.shape[1] < 1 or count < 1:
+        raise ValueError(f"weights: expected a bin and count >= 1, but got {weights.shape[1]} and {count=}")
+    ends = (weights + _FLOOR).cumsum(1)
     ends = torch.cat([torch.zeros_like(ends[:, :1]), ends / ends[:, -1:]], 1)
     if generator is None:
         at = torch.linspace(0, 1, count, dtype=ends.dtype, device=ends.device).repeat(len(ends), 1)
