@@ -67,14 +67,16 @@ class Buffer:
         """Add an array (N,), (N, 3) or (N, 4); return the number of its accessor.
 
         Args:
-            values: the numbers that are stored: of a normalised component, whole ones.
+            values: the numbers that are stored: of a normalised component, whole ones; of a filter, what it
+                makes of its elements instead.
             component: how they are stored.
             bounds: whether the accessor says the least and the greatest values.
             vertices: whether it is an attribute of vertices, whose rows begin at multiples of 4 bytes.
             filtered: of a compressed buffer, a filter's name and the elements (N, stride) uint8 that it makes
                 the values of; None: the values themselves are compressed.
         """
-        array = np.ascontiguousarray(np.asarray(values), component.dtype)
+        values = np.asarray(values) if filtered is None else meshopt.FILTERS[filtered[0]](filtered[1])
+        array = np.ascontiguousarray(values, component.dtype)
         rows = array.reshape(len(array), -1)
         accessor = {"bufferView": len(self.views), "componentType": component.number, "count": len(array)}
         accessor |= {"type": ELEMENTS[rows.shape[1]]} | ({"normalized": True} if component.one else {})
@@ -94,7 +96,7 @@ class Buffer:
         if not self.compressed:
             self.content += elements.tobytes()
             return view
-        name, elements = ("NONE", elements) if filtered is None else filtered
+        name, elements = filtered or ("NONE", elements)
         data, (count, stride) = meshopt.encode(elements), elements.shape
         layout = {"byteLength": len(data), "byteStride": stride, "count": count, "mode": "ATTRIBUTES"}
         layout |= {} if name == "NONE" else {"filter": name}

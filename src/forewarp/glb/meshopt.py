@@ -215,3 +215,7 @@ def from_quaternion(elements: np.ndarray) -> np.ndarray:
     places = (stored[:, 3:] + [1, 2, 3, 0]) % 4
     made[np.arange(len(stored))[:, None], places] = np.concatenate([others, fourth], 1)
     return np.clip(np.rint(made * 32767), -32767, 32767).astype(np.int16)
+
+
+# What makes numbers of decoded elements, by the filter's name.
+FILTERS = {"NONE": np.asarray, "EXPONENTIAL": from_exponential, "QUATERNION": from_quaternion}

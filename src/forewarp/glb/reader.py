@@ -30,7 +30,6 @@ _MOST = 1 << 28  # bytes of the file, and of all its arrays: some 200,000 partic
 _DEGREES, _COSINES, _LINKS = 3, 64, 16
 _WINDOWS = 1000  # at most
 _FARTHEST = 0.2  # of all time: no image's time is off by more
-_FILTERS = {"NONE": None, "EXPONENTIAL": meshopt.from_exponential, "QUATERNION": meshopt.from_quaternion}
 
 
 class Fields:
@@ -212,15 +211,14 @@ class Container:
     def _uncompressed(self, part: Fields) -> np.ndarray:
         data, stride = bytes(self._bytes(part)), part.whole("byteStride", 4, 256)
         count, mode, name = part.whole("count", 1, _MOST), part.text("mode"), part.text("filter", "NONE")
-        if mode != "ATTRIBUTES" or name not in _FILTERS or (name == "QUATERNION" and stride != 8):
+        if mode != "ATTRIBUTES" or name not in meshopt.FILTERS or (name == "QUATERNION" and stride != 8):
             raise ValueError(f"{part.place}: expected attributes, but got {mode} by {name} of {stride} bytes")
         self._take(count * stride, part.place)
         try:
             elements = meshopt.decode(data, count, stride)
         except ValueError as error:
             raise ValueError(f"{part.place}: {error}") from None
-        unfilter = _FILTERS[name]
-        return (elements if unfilter is None else unfilter(elements)).view(np.uint8).reshape(-1)
+        return meshopt.FILTERS[name](elements).view(np.uint8).reshape(-1)
 
 
 def _parsed(text: bytes) -> Any:

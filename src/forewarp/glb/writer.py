@@ -177,19 +177,18 @@ class _Store(Buffer):
         return self._exponential(values, exponents, **options)
 
     def _exponential(self, values: np.ndarray, exponents: np.ndarray | int, **options) -> int:
-        if not self.compressed:
-            return self.add(values, **options)
-        elements = meshopt.exponential(values.reshape(len(values), -1), exponents)
-        decoded = meshopt.from_exponential(elements).reshape(values.shape)
-        return self.add(decoded, filtered=("EXPONENTIAL", elements), **options)
+        if self.compressed:
+            elements = meshopt.exponential(values.reshape(len(values), -1), exponents)
+            options["filtered"] = "EXPONENTIAL", elements
+        return self.add(values, **options)
 
     def quaternions(self, values: np.ndarray, bits: int, **options) -> int:
         """Store unit quaternions (N, 4) x, y, z, w with ``bits`` a component."""
         if not self.compressed:
             return self.add(values, **options)
-        elements = meshopt.quaternion(values, bits)
-        decoded = meshopt.from_quaternion(elements)
-        return self.add(decoded, SIGNED_SHORT, filtered=("QUATERNION", elements), **options)
+        return self.add(
+            values, SIGNED_SHORT, filtered=("QUATERNION", meshopt.quaternion(values, bits)), **options
+        )
 
     def shares(self, values: np.ndarray, **options) -> int:
         """Store numbers in [0, 1]."""
