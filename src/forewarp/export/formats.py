@@ -72,15 +72,15 @@ def check_option(key: str, value: object) -> None:
     """
     if key in CHOICES:
         choices = CHOICES[key]
-        if type(value) is not type(choices[0]) or value not in choices:
-            words = ["false", "true"] if choices == (False, True) else choices
-            raise ValueError(f"{key}: expected {' or '.join(words)}, but got {value}")
-        return
-    whole = key in WHOLE_NUMBERS
-    least, most = WHOLE_NUMBERS[key] if whole else NUMBERS[key]
-    if type(value) not in ((int,) if whole else (int, float)) or not least <= value <= most:
-        kind = "a whole number" if whole else "a number"
-        raise ValueError(f"{key}: expected {kind} from {least} to {most}, but got {value}")
+        good = type(value) is type(choices[0]) and value in choices
+        expected = " or ".join(str(choice).lower() for choice in choices)
+    else:
+        whole = key in WHOLE_NUMBERS
+        least, most = WHOLE_NUMBERS[key] if whole else NUMBERS[key]
+        good = type(value) in ((int,) if whole else (int, float)) and least <= value <= most
+        expected = f"a {'whole ' * whole}number from {least} to {most}"
+    if not good:
+        raise ValueError(f"{key}: expected {expected}, but got {value}")
 
 
 def write(

@@ -19,6 +19,7 @@ from forewarp.scene.camera import mean_up
 from forewarp.scene.cloud import Ellipsoids
 from forewarp.scene.view import Moment
 
+Columns = Mapping[str, np.ndarray]  # by name, in their order
 _TYPES = {"float32": "float", "uint32": "uint", "uint8": "uchar"}
 _ALL = 1 << 31  # more points than there are
 ALONG = 0.98  # cosine of the angle between the upward direction and an axis, from which on that is vertical
@@ -26,10 +27,7 @@ _LOGIT_EPS = 1e-6  # opacities are clamped to [eps, 1 - eps], as their logits ar
 
 
 def write_ply(
-    path: Path,
-    elements: Mapping[str, Mapping[str, np.ndarray]],
-    faces: np.ndarray | None = None,
-    comments: Sequence[str] = (),
+    path: Path, elements: Mapping[str, Columns], faces: np.ndarray | None = None, comments: Sequence[str] = ()
 ) -> None:
     """Write a binary little-endian PLY.
 
@@ -42,10 +40,8 @@ def write_ply(
     lines = ["ply", "format binary_little_endian 1.0", *(f"comment {comment}" for comment in comments)]
     parts = []
     for element, columns in elements.items():
-        table = np.empty(
-            len(next(iter(columns.values()))),
-            [(name, column.dtype.newbyteorder("<")) for name, column in columns.items()],
-        )
+        layout = [(name, column.dtype.newbyteorder("<")) for name, column in columns.items()]
+        table = np.empty(len(next(iter(columns.values()))), layout)
         lines.append(f"element {element} {len(table)}")
         for name, column in columns.items():
             table[name] = column
@@ -94,7 +90,7 @@ def splat_columns(cloud: Ellipsoids, degree: int = 3) -> dict[str, np.ndarray]:
 _CHUNK_ROWS, _BITS, _SCALES, _HARMONICS = 256, (11, 10, 11), 20.0, 4.0
 
 
-def packed_columns(columns: Mapping[str, np.ndarray]) -> dict[str, dict[str, np.ndarray]]:
+def packed_columns(columns: Columns) -> dict[str, dict[str, np.ndarray]]:
     """Pack the columns of Gaussians as PlayCanvas's compressed PLY has them.
 
     256 rows are a ``chunk`` with the bounds of places, scales and colours, between which a ``vertex`` has 11,
