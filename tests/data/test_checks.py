@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from forewarp.data import dnerf, nhr, posed_video
-from forewarp.data.cameras import check_middle
+from forewarp.data.cameras import check_camera
 from forewarp.data.checks import check_seen, remarks
 from forewarp.data.files import SceneError
 from forewarp.data.images import is_premultiplied, straight, write_image
@@ -436,9 +436,9 @@ def test_all_cameras_of_a_long_walk_are_asked_for_points_at_no_cost_of_their_siz
 def test_a_middle_of_other_images_is_named(size, middle, advice):
     camera = Camera(*size, 50.0, 50.0, *middle, torch.eye(4).double(), 0.1, 1.0)
     with refused(advice):
-        check_middle(camera, "cx")
+        check_camera(camera, "cx", "k1")
 
 
 @pytest.mark.parametrize("middle", [(32, 24), (20, 24), (40, 30), (0, 0), (31, 27), (25, 18)])
 def test_a_middle_that_is_shifted_is_taken(middle):
-    check_middle(Camera(64, 48, 50.0, 50.0, *middle, torch.eye(4).double(), 0.1, 1.0), "cx")
+    check_camera(Camera(64, 48, 50.0, 50.0, *middle, torch.eye(4).double(), 0.1, 1.0), "cx", "k1")

@@ -207,7 +207,7 @@ def test_files_are_bounded_by_their_size(tmp_path, monkeypatch):
 
 def test_a_scene_of_too_many_frames_is_refused(tmp_path, monkeypatch):
     with refused("frames: expected at most 1000000 frames, but got 1000001"):
-        frames_of(tmp_path, {"frames": [0] * (MOST_FRAMES + 1)}, {})
+        frames_of(tmp_path, {"frames": [0] * (MOST_FRAMES + 1)})
     monkeypatch.setattr(files, "MOST_FRAMES", 5)
     write_rig(tmp_path / "a")
     with refused("ids: expected at most 5 items"):

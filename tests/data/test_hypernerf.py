@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 import torch
 
-from forewarp.data.cameras import smaller
 from forewarp.data.depth import SensedDepth
 from forewarp.data.hypernerf import read_camera, read_scene, write_camera
 from forewarp.data.images import write_image
@@ -196,7 +195,7 @@ def test_camera_files_that_hold_another_pose_are_named(changes, said, tmp_path):
 def test_both_spellings_of_the_tangential_distortion(tmp_path):
     path = tmp_path / "camera.json"
     write_camera(path, phone(1, size=(1073, 719)))
-    small = smaller(read_camera(path, 1, 2), 4)
+    small = read_camera(path, 1, 2).smaller(4)
     assert (small.width, small.height, small.lens) == (268, 180, LENS)  # rounded
     edit(path, {"tangential": [0.001, 0.002]})
     assert read_camera(path, 1, 2).lens.p == (0.001, 0.002)

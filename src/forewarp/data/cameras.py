@@ -76,14 +76,14 @@ def length_of(value: object, where: str, least: float = 0) -> float | None:
     return None if value is None else number(value, where, least, MOST_UNITS)
 
 
-def box_of(values: Sequence[float]) -> Box:
-    """Make the box that a config gives as x0 y0 z0 x1 y1 z1 in world units.
+def box_of(values: Sequence[float] | None) -> Box | None:
+    """Make the box that a config gives as x0 y0 z0 x1 y1 z1 in world units; None of None.
 
     >>> box_of([-1, -1, -1, 1, 1, 2]).high
     (1.0, 1.0, 2.0)
     """
     try:
-        return Box(tuple(values[:3]), tuple(values[3:]))
+        return None if values is None else Box(tuple(values[:3]), tuple(values[3:]))
     except (TypeError, ValueError) as error:
         expected = "six numbers x0 y0 z0 x1 y1 z1, each low end below its high end"
         raise mismatch("data.box", expected, short(values)) from error
@@ -110,13 +110,13 @@ def check_lens(camera: Camera, where: str) -> None:
         raise mismatch(where, "a lens that can be undone all over the picture", got, "undistort the images")
 
 
-def check_middle(camera: Camera, where: str) -> None:
+def check_camera(camera: Camera, middle: str, lens: str) -> None:
     """Refuse intrinsics of a larger or smaller image, whose middle is off by one factor on both sides, of one
-    with width and height exchanged, and shares of the size in place of pixels.
+    with width and height exchanged, and shares of the size in place of pixels; also as ``check_lens``.
 
     Args:
         camera: at the size of the stored image.
-        where: the principal point's key, for errors.
+        middle, lens: the keys of principal point and distortion, for errors.
     """
     across, down = 2 * camera.cx / camera.width, 2 * camera.cy / camera.height
     of_one_factor = min(across, down) > _LEAST_FACTOR and abs(across / down - 1) < _SAME_FACTOR
@@ -133,7 +133,8 @@ def check_middle(camera: Camera, where: str) -> None:
         advice = "width and height seem exchanged: exchange cx and cy, fl_x and fl_y"
     if advice is not None:
         got = f"({camera.cx:g}, {camera.cy:g}) of {camera.width} x {camera.height} pixels"
-        raise mismatch(where, "a principal point near the middle", got, advice)
+        raise mismatch(middle, "a principal point near the middle", got, advice)
+    check_lens(camera, lens)
 
 
 @lru_cache(1024)
@@ -143,16 +144,6 @@ def _can_be_undone(*inner: float | Lens) -> bool:
     u, v = pixels % camera.width + 0.5, torch.div(pixels, camera.width, rounding_mode="floor") + 0.5
     again, _ = camera.project(camera.directions(u, v))
     return bool(((again - torch.stack([u, v], -1)).abs() < _SAME_PIXEL).all())
-
-
-def smaller(camera: Camera, scale: int) -> Camera:
-    """Scale a camera to an image whose sides are ``scale`` times smaller; sizes are rounded, all else exact.
-
-    The skew shrinks too. Public loaders leave it as it is, which slants the image wherever it is not 0.
-    """
-    size = {"width": round(camera.width / scale), "height": round(camera.height / scale)}
-    pixels = {key: getattr(camera, key) / scale for key in ("fx", "fy", "cx", "cy", "skew")}
-    return replace(camera, **size, **pixels)
 
 
 def nine_pixels(camera: Camera) -> torch.Tensor:
@@ -220,8 +211,7 @@ def space_of(
     space = Normalisation(center, 1 / size, near / size, far / size)
 
     def moved(box: Box) -> Box:
-        ends = (tuple((v - c) * space.scale for v, c in zip(end, center)) for end in (box.low, box.high))
-        return Box(*ends)
+        return Box(*space.points(np.array([box.low, box.high])).tolist())
 
     try:
         if box is not None:
@@ -230,8 +220,7 @@ def space_of(
         if cut_out:  # the cube around the focus that holds what all images show of it
             width = max(max(camera.width / camera.fx, camera.height / camera.fy) for camera in cameras)
             half = 0.5 * float(distances.max()) * width
-            shown = Box(tuple(v - half for v in focus.tolist()), tuple(v + half for v in focus.tolist()))
-            seen = seen.intersection(moved(shown))
+            seen = seen.intersection(moved(Box((focus - half).tolist(), (focus + half).tolist())))
         return space, seen
     except ValueError as error:
         advice = "set data.near, data.far and data.box"
@@ -264,15 +253,11 @@ def _range(distances: Tensor, near: float | None, far: float | None, where: str)
     """Choose near and far in the file's units; log what is derived."""
     derived = " and ".join(name for name, value in (("near", near), ("far", far)) if value is None)
     low, high = _NEAR * float(distances.min()), _FAR * float(distances.max())
-    near, far = (
-        (low if far is None else min(low, far / 2)) if near is None else near,
-        (high if near is None else max(high, 2 * near)) if far is None else far,
-    )
+    near = min(low, math.inf if far is None else far / 2) if near is None else near
+    far = max(high, 2 * near) if far is None else far
     if not near < far:
         raise mismatch(where, "near < far", f"{near:g} and {far:g}", "set data.near, data.far")
     if derived:
-        log.warning(
-            f"{where}: {derived} derived from the cameras: near {near:.4g}, far {far:.4g} in the file's "
-            "units; where something is cut off or blurred set data.near and data.far"
-        )
+        line = f"{derived} derived from the cameras: near {near:.4g}, far {far:.4g} in the file's units"
+        log.warning(f"{where}: {line}; where something is cut off or blurred set data.near and data.far")
     return near, far

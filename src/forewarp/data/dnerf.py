@@ -111,7 +111,7 @@ def read_scene(
     near, far = length_of(near, "data.near"), length_of(far, "data.far")
     one_of(angle, "data.angle", "width", "longer")
     one_of(half_resolution, "data.half_resolution", True, False, "auto")
-    folder = scene_folder(root, scene, "dnerf")
+    folder = scene_folder(root, scene, "transforms_train.json")
     every = whole(test_every, "data.test_every", 2)
     records, assumed = _read_records(folder, axes, inverse, angle == "longer", every)
     everything = [record for split in records.values() for record in split]
@@ -159,7 +159,7 @@ def _space(
     """Find near, far and the box, and where a world of other units is moved to: see ``read_scene``."""
     distances = [float(camera.center.norm()) for camera in cameras]
     as_published = all(_LEAST_DISTANCE < distance < _MOST_DISTANCE for distance in distances)
-    given = None if box is None or box == "auto" else box_of(box)
+    given = None if box == "auto" else box_of(box)
     if not as_published:
         options = {"near": near, "far": far, "box": given, "normalise": not is_metric, "cut_out": cut_out}
         return space_of(cameras, where, **options, radius=_RADIUS)

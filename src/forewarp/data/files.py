@@ -5,7 +5,6 @@ from __future__ import annotations
 import glob
 import hashlib
 import json
-import operator
 import os
 import re
 import sys
@@ -13,6 +12,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from math import inf, isfinite
+from numbers import Integral
 from pathlib import Path
 from reprlib import repr as short
 from typing import BinaryIO
@@ -21,15 +21,7 @@ from unicodedata import category
 from forewarp.files import MOST_BYTES, check_size, load_json
 
 MOST_FRAMES = 1_000_000
-MARKERS = {  # by reader: the file that every scene of its format has
-    "dnerf": "transforms_train.json",
-    "lego_complete": "transforms_train.json",
-    "hypernerf": "dataset.json",
-    "nhr": "CamPose.inf",
-    "posed_video": "transforms.json",
-    "multicam": "poses_bounds.npy",
-}
-LAYOUTS = {  # what people call a layout: a file or folder that tells it, and what reads it
+LAYOUTS = {  # what people call a layout: a file or folder that every scene of it has, and what reads it
     "HyperNeRF": ("dataset.json", "experiment=hypernerf"),
     "NHR": ("CamPose.inf", "experiment=nhr"),
     "D-NeRF": ("transforms_train.json", "experiment=dnerf"),
@@ -147,14 +139,11 @@ def whole(value: object, where: str, least: int, multiple: int = 1) -> int:
     >>> whole(16, "size", 8)
     16
     """
-    try:
-        is_good = operator.index(value) >= least and value % multiple == 0 and not isinstance(value, bool)
-    except TypeError:
-        is_good = False
-    if not is_good:
+    is_whole = isinstance(value, Integral) and not isinstance(value, bool)
+    if not is_whole or value < least or value % multiple:
         kind = "a whole number" if multiple == 1 else f"a multiple of {multiple}"
         raise mismatch(where, f"{kind} of at least {least}", short(value), f"set {where}=...")
-    return operator.index(value)
+    return int(value)
 
 
 def numbers_of(words: list[str], count: int, where: str) -> list[float]:
@@ -229,13 +218,12 @@ def stated(content: Mapping) -> dict:
     return {key: value for key, value in content.items() if value is not None}
 
 
-def frames_of(file: Path, content: dict, common: Mapping) -> list[Entry]:
+def frames_of(file: Path, content: dict) -> list[Entry]:
     """Check the list ``frames`` of a file, which has from one to a million objects; null counts as absent.
 
     Args:
         file: for errors.
-        content: content of the file.
-        common: what a frame has where it does not say otherwise.
+        content: content of the file: also what a frame has where it does not say otherwise.
     """
     frames, where = content.get("frames"), f"{file}: frames"
     if not isinstance(frames, list) or not frames:
@@ -245,17 +233,17 @@ def frames_of(file: Path, content: dict, common: Mapping) -> list[Entry]:
     for i, frame in enumerate(frames):
         if not isinstance(frame, dict):
             raise mismatch(f"{where}[{i}]", "an object", short(frame))
-    common = stated(common)
+    common = stated(content)
     return [Entry(file, stated(frame), f"frames[{i}].", common) for i, frame in enumerate(frames)]
 
 
-def scene_folder(root: str | Path, scene: str, reader: str) -> Path:
-    """Find the folder ``root/scene``, which must hold the file of the reader's format in ``MARKERS``.
+def scene_folder(root: str | Path, scene: str, marker: str) -> Path:
+    """Find the folder ``root/scene``, which must hold ``marker``, a file that every scene of a format has.
 
     Raises:
         SceneError: where there is none, naming the scenes that there are.
     """
-    root, marker = Path(root), MARKERS[reader]
+    root = Path(root)
     if not root.is_dir():
         raise mismatch("data.root", "an existing folder", root, "set data.root")
     folder = root / scene

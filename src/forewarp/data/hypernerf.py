@@ -29,16 +29,7 @@ from torch import Tensor
 
 from forewarp.data import files
 from forewarp.data.arrays import read_cloud, read_truth, write_array, write_truth
-from forewarp.data.cameras import (
-    MOST_UNITS,
-    Normalisation,
-    box_of,
-    check_lens,
-    check_middle,
-    frustum_box,
-    pose_of,
-    smaller,
-)
+from forewarp.data.cameras import MOST_UNITS, Normalisation, box_of, check_camera, frustum_box, pose_of
 from forewarp.data.depth import SensedDepth, depths_beside, unit_of
 from forewarp.data.directions import by_translation, opposite, other_readings, transposed
 from forewarp.data.files import Entry, inside, mismatch, number, read_json, remove, scene_folder, whole
@@ -116,7 +107,7 @@ def read_scene(
     Raises:
         SceneError: for every file or value that is missing or wrong, with file and key.
     """
-    folder = scene_folder(root, scene, "hypernerf")
+    folder = scene_folder(root, scene, "dataset.json")
     images = folder / "rgb" / f"{whole(scale, 'data.scale', 1)}x"
     if not images.is_dir():
         there = ", ".join(in_order(p.name for p in folder.glob("rgb/*x") if p.is_dir())) or "none"
@@ -157,7 +148,7 @@ def read_scene(
         path = paths[item]
         camera = read_camera(inside(folder / "camera", f"{item}.json", where), near, far)
         poses.append(camera.camera_to_world)
-        camera = smaller(normalised.camera(camera), scale)
+        camera = normalised.camera(camera).smaller(scale)
         size = camera.width, camera.height
         header, options = inspect_image(path, size, f", the camera's image_size / {scale}"), {}
         if header.is_turned:
@@ -211,7 +202,7 @@ def read_scene(
         assumed.append(f"{folder / 'camera'}: {line} {', or if '.join(ways)}; if so, write them anew")
     if assumed:
         protocol["assumed"] = assumed
-    bounds = frustum_box(f.camera for f in train) if box is None else box_of(box)
+    bounds = box_of(box) or frustum_box(f.camera for f in train)
     truth = read_truth(folder / "trajectories.npz", canonical)
     if truth is not None:
         truth = replace(truth, points=normalised.points(truth.points).float())
@@ -297,8 +288,7 @@ def read_camera(path: Path, near: float, far: float) -> Camera:
     p = tuple(entry.numbers(tangential, 2, -_MOST_BENT, _MOST_BENT, [0.0] * 2))
     lens, pose = Lens(k, p) if any(k + p) else None, torch.from_numpy(pose_of(matrix, where))
     camera = Camera(int(width), int(height), focal, focal * aspect, cx, cy, pose, near, far, skew, lens)
-    check_middle(camera, entry.where("principal_point"))
-    check_lens(camera, entry.where("radial_distortion"))
+    check_camera(camera, entry.where("principal_point"), entry.where("radial_distortion"))
     return camera
 
 

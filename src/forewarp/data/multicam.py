@@ -21,7 +21,7 @@ import numpy as np
 import torch
 
 from forewarp.data.arrays import load_numpy
-from forewarp.data.cameras import MOST_UNITS, box_of, length_of, pose_of, smaller, space_of
+from forewarp.data.cameras import MOST_UNITS, box_of, length_of, pose_of, space_of
 from forewarp.data.directions import inverted, other_readings
 from forewarp.data.files import mismatch, number, one_of, scene_folder, whole
 from forewarp.data.films import STORE, Film
@@ -96,7 +96,7 @@ def read_scene(
 
     Cost: a pass over each video that decodes its first frame alone; a small read of each image.
     """
-    folder = scene_folder(root, scene, "multicam")
+    folder = scene_folder(root, scene, FILE)
     one_of(normalise, "data.normalise", True, False)
     scale, every = whole(scale, "data.scale", 1), whole(test_every, "data.test_every", 1)
     paths = _paths(folder)
@@ -107,7 +107,7 @@ def read_scene(
     assumed += exif_turned(turned, folder)
     held, moments = held_cameras(test_cameras, list(paths), [0]), held_moments(test_moments, count)
     factors = [_factor(track, camera, scale) for track, camera in zip(tracks, whole_cameras)]
-    cameras = [smaller(camera, scale) for camera in whole_cameras]
+    cameras = [camera.smaller(scale) for camera in whole_cameras]
     bytes_of_all = 4 * count * sum(camera.width * camera.height for camera in cameras)
     films = [track.path.name for track in tracks if track.stamps is not None]
     if films and bytes_of_all > CACHE.limit and STORE.limit == 0:
@@ -127,8 +127,8 @@ def read_scene(
     near, far = length_of(near, "data.near"), length_of(far, "data.far")
     near = min(camera.near for camera in cameras) if near is None else near
     far = aslant * max(camera.far for camera in cameras) if far is None else far
-    given = None if box is None else box_of(box)
-    space, seen = space_of(cameras, str(folder / FILE), near=near, far=far, box=given, normalise=normalise)
+    options = {"near": near, "far": far, "box": box_of(box), "normalise": normalise}
+    space, seen = space_of(cameras, str(folder / FILE), **options)
     cameras = [space.camera(camera) for camera in cameras]
 
     def view(moment: int, k: int) -> Frame:

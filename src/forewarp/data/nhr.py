@@ -18,7 +18,7 @@ import numpy as np
 import torch
 
 from forewarp.data.arrays import read_cloud, read_truth, shortened, write_array, write_truth
-from forewarp.data.cameras import box_of, check_middle, pose_of
+from forewarp.data.cameras import box_of, check_camera, pose_of
 from forewarp.data.directions import inverted, opposite, other_readings
 from forewarp.data.files import SceneError, mismatch, numbers_of, one_of, opened, remove, scene_folder, whole
 from forewarp.data.images import StoredImage, by, check_pixels, exif_turned, inspect_image, write_image
@@ -76,7 +76,7 @@ def read_scene(
 
     Cost: two small reads an image and one of every point.
     """
-    folder = scene_folder(root, scene, "nhr")
+    folder = scene_folder(root, scene, "CamPose.inf")
     one_of(half_resolution, "data.half_resolution", True, False)
     poses, matrices = _read_poses(folder / "CamPose.inf"), _read_intrinsics(folder / "Intrinsic.inf")
     if len(poses) != len(matrices):
@@ -104,7 +104,8 @@ def read_scene(
     bounds, assumed = _bounds(folder, numbers, len(places)) if box is None else (box_of(box), [])
     cameras = [_camera(*of, half_resolution, bounds) for of in zip(sizes, matrices, poses, strict=True)]
     for number, camera in enumerate(cameras):
-        check_middle(camera, f"{folder / 'Intrinsic.inf'}: camera {number}")
+        where = f"{folder / 'Intrinsic.inf'}: camera {number}"
+        check_camera(camera, where, where)
 
     def view(f: int, k: int) -> Frame:
         place, name = places[f], names[k]

@@ -149,7 +149,7 @@ def read_scene(
     whole(test_every, "data.test_every", 2)
     one_of(normalise, "data.normalise", True, False)
     one_of(depth_kind, "data.depth_kind", "metric", "relative", "inverse")
-    file = scene_folder(root, scene, "posed_video") / FILE
+    file = scene_folder(root, scene, FILE) / FILE
     content = stated(read_json(file))
     entries, absent, assumed = _read_entries(file, content, scale, axes, inverse, masks)
     if (file.parent / "masks").is_dir() and not any("mask_path" in f for f in content["frames"]):

@@ -20,7 +20,7 @@ from typing import TypeVar
 import numpy as np
 import torch
 
-from forewarp.data.cameras import FLIP, check_lens, check_middle, pose_of
+from forewarp.data.cameras import FLIP, check_camera, pose_of
 from forewarp.data.files import Entry, frames_of, mismatch, nearly, one_of
 from forewarp.data.images import SUFFIXES, TURN, Header, by, exif_turned, in_order, inspect_image, name_parts
 from forewarp.ops.backend import is_number
@@ -90,7 +90,7 @@ def read_frames(
 
     Cost: one read of each PNG, of a JPEG's beginning and end.
     """
-    entries, unread = with_intrinsics(frames_of(file, content, content), str(file))
+    entries, unread = with_intrinsics(frames_of(file, content), str(file))
     paths = [image_of(entry, "file_path", scale) for entry in entries]
     if optional and not any(map(os.path.isfile, paths)):
         return [], [f"{file}: none of its {len(paths)} images is there: left out", *unread]
@@ -169,8 +169,7 @@ def camera_of(
     lens = Lens(k, p) if any(k + p) else None
     camera = Camera(width, height, fx, fy, cx, cy, pose, 0.0, 0.0, lens=lens)
     camera = camera.resized(*stored) if (width, height) != tuple(stored) else camera
-    check_middle(camera, entry.where("cx"))
-    check_lens(camera, entry.where("k1"))
+    check_camera(camera, entry.where("cx"), entry.where("k1"))
     return camera
 
 

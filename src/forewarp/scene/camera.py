@@ -226,6 +226,14 @@ class Camera:
         pixels = {"fx": self.fx * sx, "fy": self.fy * sy, "cx": self.cx * sx, "cy": self.cy * sy}
         return replace(self, width=width, height=height, **pixels, skew=self.skew * sx)
 
+    def smaller(self, scale: int) -> Camera:
+        """Change to an image whose sides are ``scale`` times smaller; sizes are rounded, all else exact.
+
+        The skew shrinks too. Public loaders leave it as it is, which slants the image wherever it is not 0.
+        """
+        pixels = {key: getattr(self, key) / scale for key in ("fx", "fy", "cx", "cy", "skew")}
+        return replace(self, width=round(self.width / scale), height=round(self.height / scale), **pixels)
+
 
 def look_at(center: Vector, target: Vector, up: Vector) -> Tensor:
     """Make the pose (4, 4) of a camera at ``center`` that looks at ``target``, with ``up`` upwards.
