@@ -56,11 +56,9 @@ class Marched(Rendering):
             return parts[0]
         begins = accumulated((len(part.rgb) for part in parts), initial=0)
         names = ("rgb", "depth", "opacity", "transmittance", "weights", "colors")
-        return Marched(
-            **{name: torch.cat([getattr(part, name) for part in parts]) for name in names},
-            ray_ids=torch.cat([part.ray_ids + begin for part, begin in zip(parts, begins)]),
-            samples=sum(part.samples for part in parts),
-        )
+        columns = (torch.cat([getattr(part, name) for part in parts]) for name in names)
+        ray_ids = torch.cat([part.ray_ids + begin for part, begin in zip(parts, begins)])
+        return Marched(*columns, ray_ids, sum(part.samples for part in parts))
 
 
 @torch.no_grad()
@@ -69,7 +67,7 @@ def in_chunks(render: Callable[[slice], Rendering], count: int, chunk: int) -> R
     return Rendering.joined([render(slice(begin, begin + chunk)) for begin in range(0, count, chunk)])
 
 
-@dataclass(kw_only=True, eq=False)
+@dataclass(eq=False, kw_only=True)
 class Renderer:
     """March rays through occupied cells and composite the samples.
 
@@ -89,10 +87,8 @@ class Renderer:
 
     def __post_init__(self) -> None:
         if not self.step > 0 or not 0 <= self.color_threshold < 1 or not 0 <= self.early_stop_eps < 1:
-            raise ValueError(
-                "renderer: expected step > 0 and 0 <= color_threshold < 1 and 0 <= early_stop_eps < 1, "
-                f"but got {self}"
-            )
+            expected = "step > 0 and 0 <= color_threshold < 1 and 0 <= early_stop_eps < 1"
+            raise ValueError(f"renderer: expected {expected}, but got {self}")
 
     def with_threshold(self, color_threshold: float | None) -> Renderer:
         """Return a renderer with another ``color_threshold``; this one for None."""
@@ -238,10 +234,8 @@ class Quadrature:
 
     def __post_init__(self) -> None:
         if self.samples < 3 or self.fine_samples < 0:
-            raise ValueError(
-                "model.sampling: expected samples >= 3 and fine_samples >= 0, but got "
-                f"samples={self.samples}, fine_samples={self.fine_samples}"
-            )
+            got = f"samples={self.samples}, fine_samples={self.fine_samples}"
+            raise ValueError(f"model.sampling: expected samples >= 3 and fine_samples >= 0, but got {got}")
 
     def __call__(
         self,

@@ -71,9 +71,9 @@ def opengl_rows(pose: np.ndarray | torch.Tensor, where: str) -> list[list[float]
     return (pose_of(np.asarray(pose, np.float64), where) @ FLIP).tolist()
 
 
-def length_of(value: object, where: str, least: float = 0) -> float | None:
-    """Check a length of at least ``least`` world units that may be unknown, None."""
-    return None if value is None else number(value, where, least, MOST_UNITS)
+def number_or_none(value: object, where: str, least: float = 0, most: float = MOST_UNITS) -> float | None:
+    """Check a number, such as a length in world units, that may be unknown, None."""
+    return None if value is None else number(value, where, least, most)
 
 
 def box_of(values: Sequence[float] | None) -> Box | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 
@@ -24,6 +25,7 @@ _NEAR, _LEAST, _AGREE, _LINES = 0.05, 10, 0.4, 400  # of a fit: share, points, s
 _BEYOND = 2.0  # share of near and far within which the median of depths of the right unit lies
 
 
+@dataclass(eq=False)
 class SensedDepth:
     """Depth of an image and how far to trust it, (2, H, W) float32: the distance along a pixel's ray in world
     units, 0 where there is none, and its confidence in [0, 1]. Read at its first use and kept while there is
@@ -40,17 +42,12 @@ class SensedDepth:
         known: (N, 3), world units. An image that shows too few of them, or contradicts them, is all holes.
     """
 
-    def __init__(
-        self,
-        path: Path,
-        camera: Camera,
-        scale: float = 1.0,
-        confidence: Path | None = None,
-        kind: str = "metric",
-        known: Tensor | None = None,
-    ) -> None:
-        self.path, self.camera, self.scale, self.confidence = path, camera, scale, confidence
-        self.kind, self.known = kind, known
+    path: Path
+    camera: Camera
+    scale: float = 1.0
+    confidence: Path | None = None
+    kind: str = "metric"
+    known: Tensor | None = None
 
     def __call__(self) -> Tensor:
         """Give both; SceneError where a file holds anything else."""

@@ -16,6 +16,8 @@ _LEAST_CAMERAS = 4  # of which can be told whether they look at something in com
 _ALL = 0.9  # share of cameras before which a common point must lie
 _MET = 0.05  # miss of axes that meet where a program made all cameras look
 _RISE = 0.05  # sine of the angle by which cameras are above or below what they look at
+_KEEP = "set data.axes=opengl if they are right"
+_OUTWARDS = "set data.axes=opencv, or data.axes=opengl if they do look outwards"
 _CONVERT = "convert poses of Unity (left-handed) or PyTorch3D (docs/own-data.md)"
 _MEET, _MISS = 0.15, 0.5  # miss of the axes in shares of the distance: they meet in a point, they do not
 
@@ -37,42 +39,43 @@ def check_directions(poses: Sequence[torch.Tensor], where: str, *, inverse: bool
         return
     poses = torch.stack([*poses])
     miss, ahead, _ = _meeting(poses)
-    expected = "cameras that look at what they surround (OpenGL's axes: x right, y up, looking along -z)"
     missed, before, _ = _meeting(x_ahead(poses))
+    expected = "cameras that look at what they surround (OpenGL's axes: x right, y up, looking along -z)"
+    got = ""
     if (miss >= _MEET or ahead == 0) and missed < min(_MET, miss / 2) and before == 1:
         got = "cameras that look at one point only if x is ahead, as of ROS and Isaac"
-        advice = advice or "convert them (docs/own-data.md), or set data.axes=opengl if they are right"
-        raise mismatch(where, expected, got, advice)
-    if miss < _MEET and ahead == 0:
-        mended = "set data.axes=opencv, or data.axes=opengl if they do look outwards"
+        mended = f"convert them (docs/own-data.md), or {_KEEP}"
+    elif miss < _MEET and ahead == 0:
+        got, mended = "cameras that all look away from one point", _OUTWARDS
         if _rise(opposite(poses)) <= _RISE:  # as of a mirrored world, in which axes meet, too
-            mended = f"{_CONVERT}; else {mended}"
-        raise mismatch(where, expected, "cameras that all look away from one point", advice or mended)
-    if miss < _MEET and ahead < _ALL:
+            mended = f"{_CONVERT}; else {_OUTWARDS}"
+    elif miss < _MEET and ahead < _ALL:
         expected, got = "cameras that look at one thing", f"{1 - ahead:.0%} of them that look away from it"
-        advice = advice or "write all in the same axes, or set data.axes=opengl if they are right"
-        raise mismatch(where, expected, got, advice)
+        mended = f"write all in the same axes, or {_KEEP}"
+    if got:
+        raise mismatch(where, expected, got, advice or mended)
     if inverse:
         return
+    expected, got = "camera-to-world matrices", "cameras that look at nothing in common, as their inverses do"
+    if keys := other_readings(poses, _KEYS):
+        raise mismatch(where, expected, got, advice or f"set {keys[0].replace(' and ', ' ')}, or {_KEEP}")
+    refuse_other_readings(poses, _HALVES, where, expected, advice or f"write them so, or {_KEEP}")
 
-    def of_file(change: _Change) -> _Change:
-        """Change matrices as they are in the file, where they were read as ``matrix @ FLIP``."""
-        return lambda poses: opposite(change(opposite(poses)))
 
-    whole = {"data.inverse=true": of_file(inverted), "data.axes=opencv": opposite}
-    halves = {
-        "rotations are transposed": of_file(transposed),
-        "translations are of world-to-camera matrices": of_file(by_translation),
-        "axes are OpenCV's": opposite,
-    }
-    if keys := other_readings(poses, whole):
-        got = "cameras that look at nothing in common, as their inverses do"
-        advice = advice or f"set {keys[0].replace(' and ', ' ')}, or data.axes=opengl if they are right"
-        raise mismatch(where, "camera-to-world matrices", got, advice)
-    if ways := other_readings(poses, halves):
-        got = f"cameras that look at one thing only if {', or if '.join(ways)}"
-        advice = advice or "write them so, or set data.axes=opengl if they are right"
-        raise mismatch(where, "camera-to-world matrices", got, advice)
+def refuse_other_readings(poses, readings, where: object, expected: str, advice="convert them") -> None:
+    """Refuse poses that make sense only in other ways.
+
+    Args:
+        poses, readings: see ``poses`` and ``changes`` of ``other_readings``.
+        where, expected, advice: of the error.
+
+    Raises:
+        SceneError: naming these ways.
+    """
+    if ways := other_readings(poses, readings):
+        raise mismatch(
+            where, expected, f"cameras that look at one thing only if {', or if '.join(ways)}", advice
+        )
 
 
 def other_readings(poses: Sequence[torch.Tensor], changes: Mapping[str, _Change]) -> list[str]:
@@ -110,16 +113,12 @@ def opposite(poses: torch.Tensor) -> torch.Tensor:
 
 def x_ahead(poses: torch.Tensor) -> torch.Tensor:
     """Take poses (N, 4, 4) that were read as OpenGL's for x ahead, y left and z up."""
-    changed = poses.clone()
-    changed[:, :3, :3] = poses[:, :3, [1, 2, 0]]
-    return changed
+    return poses[..., [1, 2, 0, 3]]
 
 
 def transposed(poses: torch.Tensor) -> torch.Tensor:
     """Invert the rotations of poses (N, 4, 4) alone."""
-    changed = poses.clone()
-    changed[:, :3, :3] = poses[:, :3, :3].mT
-    return changed
+    return inverted(by_translation(poses))
 
 
 def by_translation(poses: torch.Tensor) -> torch.Tensor:
@@ -132,6 +131,19 @@ def by_translation(poses: torch.Tensor) -> torch.Tensor:
 def inverted(poses: torch.Tensor) -> torch.Tensor:
     """Take world-to-camera matrices (N, 4, 4) for camera-to-world ones, or the other way round."""
     return torch.linalg.inv(poses)
+
+
+def _of_file(change: _Change) -> _Change:
+    """Change matrices as they are in the file, where they were read as ``matrix @ FLIP``."""
+    return lambda poses: opposite(change(opposite(poses)))
+
+
+_KEYS = {"data.inverse=true": _of_file(inverted), "data.axes=opencv": opposite}
+_HALVES = {
+    "rotations are transposed": _of_file(transposed),
+    "translations are of world-to-camera matrices": _of_file(by_translation),
+    "axes are OpenCV's": opposite,
+}
 
 
 def common_point(poses: Sequence[torch.Tensor]) -> torch.Tensor | None:

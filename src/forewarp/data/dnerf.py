@@ -24,7 +24,15 @@ import numpy as np
 from torch import Tensor
 
 from forewarp.data.arrays import StoredDepth, read_truth, write_array, write_truth
-from forewarp.data.cameras import SPLITS, Normalisation, box_of, frustum_box, length_of, opengl_rows, space_of
+from forewarp.data.cameras import (
+    SPLITS,
+    Normalisation,
+    box_of,
+    frustum_box,
+    number_or_none,
+    opengl_rows,
+    space_of,
+)
 from forewarp.data.directions import check_directions, common_point
 from forewarp.data.files import mismatch, nearly, number, one_of, read_json, remove, scene_folder, whole
 from forewarp.data.images import StoredImage, alpha_of, by, check_pixels, inspect_image, write_image
@@ -108,7 +116,7 @@ def read_scene(
     Raises:
         SceneError: for every file or value that is missing or wrong, with file and key.
     """
-    near, far = length_of(near, "data.near"), length_of(far, "data.far")
+    near, far = number_or_none(near, "data.near"), number_or_none(far, "data.far")
     one_of(angle, "data.angle", "width", "longer")
     one_of(half_resolution, "data.half_resolution", True, False, "auto")
     folder = scene_folder(root, scene, "transforms_train.json")
@@ -138,11 +146,9 @@ def read_scene(
     train, val, test = (tuple(map(frame, records[split])) for split in SPLITS)
     canonical = min(f.time for f in train)
     protocol = {"dataset": "dnerf", "resolution": [width, height], "half_resolution": halve}
-    protocol["test_frames"] = len(test)
-    if space.scale != 1 or any(space.center):
-        protocol["normalisation"] = space.told
-    if assumed:
-        protocol["assumed"] = assumed
+    is_moved = space.scale != 1 or any(space.center)
+    protocol |= {"test_frames": len(test), "normalisation": space.told if is_moved else None}
+    protocol["assumed"] = assumed or None
     truth = read_truth(folder / "trajectories.npz", canonical)
     return Scene(scene, train, val, test, bounds, canonical, has_alpha, truth, protocol)
 

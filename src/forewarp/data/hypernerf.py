@@ -181,6 +181,15 @@ def read_scene(
     if len(counts) > 1:
         where = folder / "keypoint" / f"{scale}x" / of_train
         raise mismatch(where, "as many keypoints in each file", f"{min(counts)} and {max(counts)}")
+    seconds = None
+    if (folder / "extra.json").is_file():
+        extra = Entry(folder / "extra.json", read_json(folder / "extra.json"))
+        seconds = (last - first) / extra.number("fps", *_RATES)
+    assumed += exif_turned(turned, images)
+    if ways := other_readings(poses, _READINGS):
+        line = "cameras do not look at one thing, as all of them do if"
+        assumed.append(f"{folder / 'camera'}: {line} {', or if '.join(ways)}; if so, write them anew")
+    has_masks = any(f.load_valid for f in train)
     protocol = {
         "dataset": "hypernerf" if depth is None else "iphone",
         "scale": scale,
@@ -188,20 +197,11 @@ def read_scene(
         "resolution": [train[0].camera.width, train[0].camera.height],
         "train_frames": len(train),
         "test_frames": len(test),
+        "seconds": seconds,
+        "depth": None if depth is None else f"{depth}, of {len(depths)} of {len(train)} training frames",
+        "masks": "ignore: pixels of alpha 0 are not trained or measured on" if has_masks else None,
+        "assumed": assumed or None,
     }
-    if (folder / "extra.json").is_file():
-        extra = Entry(folder / "extra.json", read_json(folder / "extra.json"))
-        protocol["seconds"] = (last - first) / extra.number("fps", *_RATES)
-    if depth is not None:
-        protocol["depth"] = f"{depth}, of {len(depths)} of {len(train)} training frames"
-    if any(f.load_valid for f in train):
-        protocol["masks"] = "ignore: pixels of alpha 0 are not trained or measured on"
-    assumed += exif_turned(turned, images)
-    if ways := other_readings(poses, _READINGS):
-        line = "cameras do not look at one thing, as all of them do if"
-        assumed.append(f"{folder / 'camera'}: {line} {', or if '.join(ways)}; if so, write them anew")
-    if assumed:
-        protocol["assumed"] = assumed
     bounds = box_of(box) or frustum_box(f.camera for f in train)
     truth = read_truth(folder / "trajectories.npz", canonical)
     if truth is not None:

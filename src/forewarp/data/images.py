@@ -277,11 +277,8 @@ def is_premultiplied(images: Iterable[Tensor]) -> bool:
     alpha, would be at least half as bright as what is opaque: black shadows and outlines are below every
     alpha. There must be some, and next to no pixel of any alpha may be brighter than it.
     """
-    brightest, alpha = [], []
-    for rgba in images:
-        brightest.append(rgba[..., :3].amax(-1).flatten().int())
-        alpha.append(rgba[..., 3].flatten().int())
-    brightest, alpha = torch.cat(brightest), torch.cat(alpha)
+    pixels = torch.cat([rgba.reshape(-1, 4) for rgba in images])
+    brightest, alpha = pixels[:, :3].amax(-1).int(), pixels[:, 3].int()
     solid = brightest[alpha == 255]
     if not len(solid):
         return False
@@ -318,6 +315,7 @@ def composited(rgba: Tensor, background: Tensor) -> Tensor:
     return torch.lerp(background.expand_as(shown[..., :3]), shown[..., :3], shown[..., 3:])
 
 
+@dataclass(eq=False)
 class StoredImage:
     """An image decoded at its first use and kept while there is room, uint8 (H, W, 4); it is read-only.
 
@@ -335,28 +333,21 @@ class StoredImage:
         premultiplied: colours on disk are multiplied by alpha.
     """
 
-    def __init__(
-        self,
-        path: Path,
-        size: tuple[int, int],
-        factor: int = 1,
-        mask: Path | None = None,
-        opaque: bool = False,
-        premultiplied: bool = False,
-    ) -> None:
-        self.path, self.size, self.factor, self.mask = path, size, factor, mask
-        self.opaque, self.premultiplied = opaque, premultiplied
-        self._corner = (0, 0)
+    path: Path
+    size: tuple[int, int]
+    factor: int = 1
+    mask: Path | None = None
+    opaque: bool = False
+    premultiplied: bool = False
 
     def __call__(self) -> Tensor:
         """Give the pixels; SceneError where a file cannot be decoded or has another size."""
         part = CACHE.get(self, self._decode)
         if self.mask is None:
             return part
-        (row, column), (rows, columns) = self._corner, part.shape[:2]
         width, height = (n // self.factor for n in self.size)
         whole = torch.zeros(height, width, 4, dtype=torch.uint8)
-        whole[row : row + rows, column : column + columns] = part
+        whole[self._rectangle] = part
         return whole
 
     def _decode(self) -> Tensor:
@@ -371,11 +362,9 @@ class StoredImage:
         rgba *= (bright(self.mask, self.size) & (rgba[..., 3] > 0))[..., None]
         rgba = rgba if self.factor == 1 else halved_cutout(rgba)
         foreground = rgba[..., 3] > 0
-        if not bool(foreground.any()):
-            return rgba[:0, :0].clone()
-        rows, columns = (foreground.any(axis).nonzero()[:, 0] for axis in (1, 0))
-        self._corner = (int(rows[0]), int(columns[0]))
-        return rgba[self._corner[0] : int(rows[-1]) + 1, self._corner[1] : int(columns[-1]) + 1].clone()
+        sides = (foreground.any(axis).nonzero()[:, 0].tolist() for axis in (1, 0))
+        self._rectangle = tuple(slice(side[0], side[-1] + 1) if side else slice(0) for side in sides)
+        return rgba[self._rectangle].clone()
 
 
 class StoredMask:

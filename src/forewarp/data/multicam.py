@@ -21,8 +21,8 @@ import numpy as np
 import torch
 
 from forewarp.data.arrays import load_numpy
-from forewarp.data.cameras import MOST_UNITS, box_of, length_of, pose_of, space_of
-from forewarp.data.directions import inverted, other_readings
+from forewarp.data.cameras import MOST_UNITS, box_of, number_or_none, pose_of, space_of
+from forewarp.data.directions import inverted, refuse_other_readings
 from forewarp.data.files import mismatch, number, one_of, scene_folder, whole
 from forewarp.data.films import STORE, Film
 from forewarp.data.images import CACHE, SUFFIXES, TURN, StoredImage, by, exif_turned, in_order, inspect_image
@@ -124,7 +124,7 @@ def read_scene(
             size = (camera.width, camera.height)
             loads.append(Film(track.path, track.stamps[:count], size, bytes_of_all).images)
     aslant = max(math.hypot(1, math.hypot(c.width / c.fx, c.height / c.fy) / 2) for c in cameras)
-    near, far = length_of(near, "data.near"), length_of(far, "data.far")
+    near, far = number_or_none(near, "data.near"), number_or_none(far, "data.far")
     near = min(camera.near for camera in cameras) if near is None else near
     far = aslant * max(camera.far for camera in cameras) if far is None else far
     options = {"near": near, "far": far, "box": box_of(box), "normalise": normalise}
@@ -138,6 +138,7 @@ def read_scene(
     taken = ((moment, view(moment, k)) for moment in range(count) for k in range(len(cameras)))
     train, test = split_rig(taken, held, moments, every)
     sizes = sorted({(camera.width, camera.height) for camera in cameras}, reverse=True)
+    stamps = next((track.stamps for track in tracks if track.stamps is not None), None)
     protocol = {
         "dataset": "multicam",
         "resolution": list(sizes[0]) if len(sizes) == 1 else [list(size) for size in sizes],
@@ -150,13 +151,11 @@ def read_scene(
         "normalisation": space.told,
         "near": space.near,
         "far": space.far,
+        "seconds": None if stamps is None or count == 1 else float(stamps[count - 1] - stamps[0]),
+        "assumed": assumed or None,
     }
-    stamps = next((track.stamps for track in tracks if track.stamps is not None), None)
-    if stamps is not None and count > 1:
-        protocol["seconds"] = float(stamps[count - 1] - stamps[0])
-    if assumed:
-        protocol["assumed"] = assumed
-    return Scene(scene, train, (), test, seen, middle_of([f.time for f in train]), False, protocol=protocol)
+    canonical = middle_of(frame.time for frame in train)
+    return Scene(scene, train, (), test, seen, canonical, False, protocol=protocol)
 
 
 def write_poses(folder: str | Path, cameras: Sequence[Camera], *, near: float, far: float) -> None:
@@ -228,10 +227,8 @@ def _read_rows(path: Path, names: Sequence[str]) -> list[Camera]:
             raise mismatch(f"{where}: bounds", "0 < near < far", f"{near:g} and {far:g}")
         middle = width / 2, height / 2
         cameras.append(Camera(int(width), int(height), focal, focal, *middle, pose, near, far))
-    if ways := other_readings([camera.camera_to_world for camera in cameras], _READINGS):
-        expected = "[R | T] camera-to-world with the axes down, right, backwards"
-        got = f"cameras that look at one thing only if {', or if '.join(ways)}"
-        raise mismatch(path, expected, got, "convert them")
+    expected = "[R | T] camera-to-world with the axes down, right, backwards"
+    refuse_other_readings([camera.camera_to_world for camera in cameras], _READINGS, path, expected)
     return cameras
 
 

@@ -19,7 +19,7 @@ import torch
 
 from forewarp.data.arrays import read_cloud, read_truth, shortened, write_array, write_truth
 from forewarp.data.cameras import box_of, check_camera, pose_of
-from forewarp.data.directions import inverted, opposite, other_readings
+from forewarp.data.directions import inverted, opposite, refuse_other_readings
 from forewarp.data.files import SceneError, mismatch, numbers_of, one_of, opened, remove, scene_folder, whole
 from forewarp.data.images import StoredImage, by, check_pixels, exif_turned, inspect_image, write_image
 from forewarp.data.rigs import held_cameras, held_moments, split_rig
@@ -116,6 +116,9 @@ def read_scene(
     span = max(numbers[-1] - numbers[0], 1)
     taken = ((f, view(f, k)) for f in range(moments) for k in range(len(poses)))
     train, test = split_rig(taken, held, held_times, every)
+    if on_disk[0] != 0 or first != 0 or on_disk[-1] - on_disk[0] >= len(on_disk):
+        said = f"frames {on_disk[0]} to {on_disk[-1]} ({len(on_disk)}) and cameras from {first}"
+        assumed = [f"{folder / 'img'}: {said} taken in order, times by their numbers", *assumed]
     protocol = {
         "dataset": "nhr",
         "resolution": [list(size) for size in sorted({(c.width, c.height) for c in cameras}, reverse=True)],
@@ -125,14 +128,9 @@ def read_scene(
         "test_views": held,
         "test_frames": len(test),
         "mask_box": True,
+        "test_moments": sorted(held_times) or None,
+        "assumed": [*assumed, *exif_turned(turned, folder / "img")] or None,
     }
-    if held_times:
-        protocol["test_moments"] = sorted(held_times)
-    if on_disk[0] != 0 or first != 0 or on_disk[-1] - on_disk[0] >= len(on_disk):
-        said = f"frames {on_disk[0]} to {on_disk[-1]} ({len(on_disk)}) and cameras from {first}"
-        assumed = [f"{folder / 'img'}: {said} taken in order, times by their numbers", *assumed]
-    if assumed := [*assumed, *exif_turned(turned, folder / "img")]:
-        protocol["assumed"] = assumed
     truth = read_truth(folder / "trajectories.npz", 0.0)
     if truth is not None and moments < len(places):  # the file's times are those of all frames on disk
         truth = shortened(truth, (numbers[-1] - numbers[0]) / (on_disk[-1] - on_disk[0]))
@@ -194,9 +192,7 @@ def _read_poses(path: Path) -> list[np.ndarray]:
             except SceneError:
                 raise error from None
             raise mismatch(where, expected, "its rows", "write the columns one after the other") from None
-    if ways := other_readings([torch.from_numpy(pose) for pose in poses], _READINGS):
-        got = f"cameras that look at one thing only if {', or if '.join(ways)}"
-        raise mismatch(path, expected, got, "convert them")
+    refuse_other_readings([torch.from_numpy(pose) for pose in poses], _READINGS, path, expected)
     return poses
 
 

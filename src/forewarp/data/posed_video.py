@@ -26,20 +26,10 @@ import numpy as np
 from torch import Tensor
 
 from forewarp.data.arrays import read_cloud, write_array
-from forewarp.data.cameras import MOST_UNITS, SPLITS, box_of, length_of, opengl_rows, space_of
+from forewarp.data.cameras import MOST_UNITS, SPLITS, box_of, number_or_none, opengl_rows, space_of
 from forewarp.data.depth import LEVELS, MILLIMETRES, SensedDepth, confidence_of, depths_beside, depths_named
 from forewarp.data.directions import check_directions
-from forewarp.data.files import (
-    inside,
-    mismatch,
-    number,
-    one_of,
-    read_json,
-    remove,
-    scene_folder,
-    stated,
-    whole,
-)
+from forewarp.data.files import inside, mismatch, one_of, read_json, remove, scene_folder, stated, whole
 from forewarp.data.images import (
     SUFFIXES,
     MovingMask,
@@ -172,9 +162,9 @@ def read_scene(
     if not by_name:
         parts, how = _split_entries(file, content, entries, test_every, absent)
     check_times({split: {e.name: given[e.name] for e in part} for split, part in parts.items()}, str(file))
-    near, far = length_of(near, "data.near"), length_of(far, "data.far", 1 / MOST_UNITS)
-    near = length_of(content.get("near"), f"{file}: near") if near is None else near
-    far = length_of(content.get("far"), f"{file}: far", 1 / MOST_UNITS) if far is None else far
+    near, far = number_or_none(near, "data.near"), number_or_none(far, "data.far", 1 / MOST_UNITS)
+    near = number_or_none(content.get("near"), f"{file}: near") if near is None else near
+    far = number_or_none(content.get("far"), f"{file}: far", 1 / MOST_UNITS) if far is None else far
     bounds = _bounds(file, content, box)
     shown = (e for e in entries if e.load.mask or (e.is_cut_out and bool((e.load()[..., 3] < 255).any())))
     has_alpha = (first := next(shown, None)) is not None
@@ -182,7 +172,7 @@ def read_scene(
         expected, got = "one colour where pixels are transparent", "an image beneath them too"
         advice = "set data.masks=alpha if that is beside the subject, data.masks=off if alpha is of other use"
         raise mismatch(first.path, expected, got, advice)
-    if masks is None and entries[0].valid is not None:
+    if masks is None and entries[0].beside["load_valid"] is not None:
         line = "dark pixels of mask_path are not trained or measured on"
         assumed.append(f"{file}: {line}; if they are beside a subject to cut out, set data.masks=alpha")
     options = {"near": near, "far": far, "box": bounds, "normalise": normalise, "cut_out": has_alpha}
@@ -208,14 +198,13 @@ def read_scene(
         unit = 1.0
         if depth_kind == "metric":
             unit = (MILLIMETRES if path.suffix == ".png" else 1.0) if depth_scale is None else depth_scale
-            unit = number(unit, "data.depth_scale", 1 / MOST_UNITS, MOST_UNITS) * space.scale
+            unit = number_or_none(unit, "data.depth_scale", 1 / MOST_UNITS) * space.scale
         top = place or file.parent / path.relative_to(file.parent).parts[0]
         return SensedDepth(path, camera, unit, confidence_of(path, top), depth_kind, still)
 
     def frame(e: ImageEntry) -> Frame:
         camera_id, camera = None if e.taken_by is None else views.index(e.taken_by), space.camera(e.camera)
-        beside = {"load_valid": e.valid, "load_moving": e.moving, "load_resting": e.resting}
-        beside["load_sensed"] = sensed(e.name, camera)
+        beside = {**e.beside, "load_sensed": sensed(e.name, camera)}
         return Frame(e.name, e.time, camera, e.load, **beside, camera_id=camera_id, moment=e.moment)
 
     train, val, test = (tuple(map(frame, parts[split])) for split in SPLITS)
@@ -227,6 +216,13 @@ def read_scene(
     if not isinstance(moving_from := content.get("moving_from", "moving_path of the frames"), str):
         raise mismatch(f"{file}: moving_from", "text", short(moving_from))
     start = middle_of(frame.time for frame in train)
+    count, rigged = sum(f.load_sensed is not None for f in train), by_name or None
+    ignored = "ignore: PSNR is of the pixels that count, other metrics see the true colour elsewhere"
+    if cloud is None and "ply_file_path" in content:
+        assumed.append(f"{file}: ply_file_path names no file: there are no points to begin from")
+    if still is not None and cloud.suffix == ".ply":
+        line = f"its {len(still)} points are taken for points that never move"
+        assumed.append(f"{cloud}: {line}; remove it if the subject is among them")
     protocol = {
         "dataset": "video_with_poses",
         "resolution": [train[0].camera.width, train[0].camera.height],
@@ -237,28 +233,15 @@ def read_scene(
         "near": space.near,
         "far": space.far,
         "derived": [name for name in ("near", "far", "box") if options[name] is None],
+        "views": len(views) or None,
+        "test_cameras": rigged and [views[k] for k in held[0]],
+        "test_moments": rigged and sorted(held[1]),
+        "masks": train[0].load_valid and ignored,
+        "moving": train[0].load_moving and moving_from,
+        "seconds": number_or_none(content.get("seconds"), f"{file}: seconds"),
+        "depth": f"{depth_kind}, of {count} of {len(train)} training frames" if depths else None,
+        "assumed": [*assumed, *filter(None, [told])] or None,
     }
-    if views:
-        protocol["views"] = len(views)
-    if by_name:
-        protocol |= {"test_cameras": [views[k] for k in held[0]], "test_moments": sorted(held[1])}
-    if train[0].load_valid is not None:
-        line = "ignore: PSNR is of the pixels that count, other metrics see the true colour elsewhere"
-        protocol["masks"] = line
-    if train[0].load_moving is not None:
-        protocol["moving"] = moving_from
-    if "seconds" in content:
-        protocol["seconds"] = number(content["seconds"], f"{file}: seconds", 0, 1e9)
-    if depths:
-        count = sum(f.load_sensed is not None for f in train)
-        protocol["depth"] = f"{depth_kind}, of {count} of {len(train)} training frames"
-    if cloud is None and "ply_file_path" in content:
-        assumed.append(f"{file}: ply_file_path names no file: there are no points to begin from")
-    if still is not None and cloud.suffix == ".ply":
-        line = f"its {len(still)} points are taken for points that never move"
-        assumed.append(f"{cloud}: {line}; remove it if the subject is among them")
-    if assumed := [*assumed, *filter(None, [told])]:
-        protocol["assumed"] = assumed
     return Scene(scene, train, val, test, seen, start, has_alpha, protocol=protocol, still=still)
 
 
@@ -272,18 +255,16 @@ def _points_of(file: Path, content: dict) -> Path | None:
 @dataclass(frozen=True)
 class ImageEntry(ListedImage):
     """A checked frame: ``name`` is its path without its suffix; ``is_cut_out`` says whether its own alpha may
-    cut it out.
+    cut it out; ``beside`` are the masks ``load_valid``, ``load_moving`` and ``load_resting`` of a ``Frame``.
     """
 
     name: str
     load: StoredImage
     is_cut_out: bool
-    valid: StoredMask | None = None
-    moving: MovingMask | None = None
-    resting: MovingMask | None = None
-    taken_by: str | None = None
-    moment: int | None = None
-    depth: Path | None = None
+    beside: dict
+    taken_by: str | None
+    moment: int | None
+    depth: Path | None
 
 
 def _read_entries(
@@ -318,28 +299,17 @@ def _read_entries(
         load = StoredImage(image.path, image.header.size, mask=None if valid else mask, opaque=opaque)
         has_mask.append(mask is not None)
         name = _name_of(file.parent, entry.own.get("file_path"), entry.where("file_path"))
-        moving, resting = (_motion(image, key, scale) for key in ("moving_path", "resting_path"))
+        beside = {f"load_{kind}": _motion(image, f"{kind}_path", scale) for kind in ("moving", "resting")}
+        beside["load_valid"] = valid
         taken_by = entry.own.get("camera")
         taken_by = str(taken_by) if type(taken_by) in (str, int) else None  # an object is another program's
         moment = whole(entry.own["moment"], entry.where("moment"), 0) if "moment" in entry.own else None
         depth = entry.path("depth_file_path") if "depth_file_path" in entry.own else None
-        entries.append(
-            ImageEntry(
-                **vars(image),
-                name=name,
-                load=load,
-                is_cut_out=has_alpha and not opaque,
-                valid=valid,
-                moving=moving,
-                resting=resting,
-                taken_by=taken_by,
-                moment=moment,
-                depth=depth,
-            )
-        )
+        own = name, load, has_alpha and not opaque, beside, taken_by, moment, depth
+        entries.append(ImageEntry(*vars(image).values(), *own))
     for key, given in (
         ("mask_path", has_mask),
-        ("moving_path", [e.moving is not None for e in entries]),
+        ("moving_path", [e.beside["load_moving"] is not None for e in entries]),
         ("camera", [e.taken_by is not None for e in entries]),
         ("moment", [e.moment is not None for e in entries]),
         ("file_path: alpha", [e.is_cut_out or e.load.mask is not None for e in entries]),
@@ -431,12 +401,11 @@ def _listed(file: Path, content: dict, key: str, entries: list[ImageEntry], abse
 
 def _bounds(file: Path, content: dict, box: Sequence[float] | None) -> Box | None:
     """Take the box, in the file's units, from the config, else from the file, else None."""
-    if box is not None:
+    corners = content.get("aabb")
+    if box is not None or corners is None:
         return box_of(box)
-    if (corners := content.get("aabb")) is None:
-        return None
     try:
-        return Box(*(tuple(number(v, "aabb", -MOST_UNITS, MOST_UNITS) for v in corner) for corner in corners))
+        return Box(*(tuple(number_or_none(v, "aabb", -MOST_UNITS) for v in corner) for corner in corners))
     except (TypeError, ValueError) as error:
         expected = "[[x0, y0, z0], [x1, y1, z1]], each low end below its high end"
         raise mismatch(f"{file}: aabb", expected, short(corners)) from error
@@ -477,9 +446,8 @@ def write_scene(
     common = {key: value for key, value in common.items() if all(e.get(key) == value for e in entries)}
     content = {**common, **{f"{split}_filenames": lists[split] for split in SPLITS if lists[split]}}
     corners = None if aabb is None else [aabb.low, aabb.high]
-    content |= stated(
-        {"near": near, "far": far, "seconds": seconds, "moving_from": moving_from, "aabb": corners}
-    )
+    content |= stated({"near": near, "far": far, "seconds": seconds, "moving_from": moving_from})
+    content |= stated({"aabb": corners})
     content["frames"] = [{k: v for k, v in entry.items() if k not in common} for entry in entries]
     write_array(folder / POINTS, points if points is not None and len(points) else None)
     write_json(folder / FILE, content)
@@ -505,8 +473,7 @@ def _write_shot(folder: Path, shot: PosedShot, taken: set[str]) -> dict:
     entry |= {"fl_y": camera.fy, "cx": camera.cx, "cy": camera.cy, "camera_model": "OPENCV"}
     if camera.lens is not None:
         entry |= dict(zip(("k1", "k2", "k3", "p1", "p2"), camera.lens.k + camera.lens.p))
-    if shot.time is not None:
-        entry["time"] = number(shot.time, f"{shot.name}: time", 0, 1)
+    entry |= stated({"time": number_or_none(shot.time, f"{shot.name}: time", most=1)})
     entry["transform_matrix"] = opengl_rows(camera.camera_to_world, shot.name)
     entry |= stated({"camera": shot.taken_by, "moment": shot.moment})
     write_image(folder / entry["file_path"], pixels)

@@ -71,7 +71,7 @@ class Scene:
     """All frames of one subject, read once.
 
     ``box`` bounds everything visible; ``canonical_time`` in [0, 1]; ``has_alpha``: the images separate
-    foreground from background; ``protocol`` says how numbers are measured; ``still`` (N, 3) float32: points
+    foreground from background; ``protocol`` says how numbers are measured, less what is None; ``still`` (N, 3) float32: points
     that never move, world units, if known; ``held``: held-out frames, never trained on.
     """
 
@@ -88,6 +88,10 @@ class Scene:
     held: tuple[Frame, ...] = ()
 
     __repr__ = brief
+
+    def __post_init__(self) -> None:
+        told = {key: value for key, value in self.protocol.items() if value is not None}
+        object.__setattr__(self, "protocol", told)
 
     @property
     def times(self) -> tuple[float, ...]:
