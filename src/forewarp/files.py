@@ -122,10 +122,9 @@ def refuse_links(folder: Path) -> None:
     for parent, folders, files in os.walk(folder):
         for name in sorted((*folders, *files)):
             if os.path.islink(path := os.path.join(parent, name)):
-                raise ValueError(
-                    f"{path}: expected no links inside a run's folder, as files would be written where they "
-                    f"lead, but got one to {os.readlink(path)}; put the file itself there, or delete the link"
-                )
+                expected = "no links inside a run's folder, as files would be written where they lead"
+                got = f"one to {os.readlink(path)}; put the file itself there, or delete the link"
+                raise ValueError(f"{path}: expected {expected}, but got {got}")
 
 
 def check_replaceable(path: Path, mark: str) -> None:
@@ -209,10 +208,8 @@ def decoded(raw: bytes, path: Path) -> str:
         return raw.decode(json.detect_encoding(raw))
     except UnicodeDecodeError as error:
         line, byte = raw.count(b"\n", 0, error.start) + 1, raw[error.start]
-        raise ValueError(
-            f"{path}: line {line}: expected text in UTF-8, but got the byte 0x{byte:02x}, as of Latin-1; "
-            "save the file as UTF-8"
-        ) from error
+        got = f"the byte 0x{byte:02x}, as of Latin-1; save the file as UTF-8"
+        raise ValueError(f"{path}: line {line}: expected text in UTF-8, but got {got}") from error
 
 
 def read_rows(path: Path) -> list[dict[str, str]]:

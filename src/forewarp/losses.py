@@ -33,8 +33,7 @@ def point_color(
     """
     per_sample = weights.detach() * (colors - truth[ray_ids]).square().sum(-1)
     if all_ray_ids is not None:
-        count = torch.bincount(all_ray_ids, minlength=len(truth))
-        per_sample = per_sample / count[ray_ids]
+        per_sample = per_sample / torch.bincount(all_ray_ids, minlength=len(truth))[ray_ids]
     return per_sample.sum() / max(len(truth), 1)
 
 
@@ -46,9 +45,7 @@ def background_entropy(transmittance: Tensor) -> Tensor:
 
 def sample_entropy(weights: Tensor) -> Tensor:
     """w2 as printed: mean binary entropy of the samples' weights (P,); 0 without samples."""
-    if not len(weights):
-        return weights.sum()
-    return background_entropy(weights)
+    return background_entropy(weights) if len(weights) else weights.sum()
 
 
 def flow_l1(flow: Tensor) -> Tensor:

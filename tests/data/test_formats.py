@@ -161,7 +161,7 @@ BAD = {
         (WORLD, {"near": 9}, "scene.json: near, far: expected near < far, but got 9 and 1.4"),
         (ITEMS, lambda c: c["ids"].append(ITEM), "ids: expected a list of different names"),
         (ITEMS, {"train_ids": ["x"]}, "train_ids: expected items of dataset.json's ids, but got 'x'"),
-        (ITEMS, {"val_ids": ["left1_000000"]}, "val_ids: expected none of train_ids, but got 'left1"),
+        (ITEMS, {"val_ids": ["left1_000000"]}, "val_ids: expected none of the items to train on"),
         (ITEMS, {"train_ids": []}, "train_ids: expected at least one beside val_ids"),
         (ITEMS, {"ids": [ITEM], "train_ids": [], "val_ids": []}, "ids: expected more than 4 items"),
         (ITEMS, lambda c: c["ids"].append("a\nb"), r"'a\\nb': expected an object for this item"),

@@ -299,7 +299,7 @@ def test_splits_take_the_place_of_the_lists(tmp_path):
         assert [f.name for f in scene.train] == train
         assert [f.name for f in scene.test] == (test or ["1_00000", "1_00001"])
     edit(folder / "splits" / "val.json", {"frame_names.0": "0_00001"})
-    with refused("val.json: frame_names: expected none of train.json, but got '0_000"):
+    with refused("val.json: frame_names: expected none of the items to train on, but got '0_000"):
         read_scene(tmp_path, "toy")
     edit(folder / "splits" / "val.json", {"frame_names.0": "none"})
     with refused("val.json: frame_names: expected items of dataset.json's ids, but got"):

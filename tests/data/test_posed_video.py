@@ -132,8 +132,8 @@ def test_points_of_a_ply_are_those_of_points_npy(tmp_path, kind):
 @pytest.mark.parametrize(
     ("text", "says"),
     [
-        ("solid\n", "a PLY whose first element is vertices with x, y, z"),
-        ("ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n0\n", "with x, y, z"),
+        ("solid\n", "a PLY whose first element is vertices of plain numbers"),
+        ("ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n0\n", "x, y, z too"),
         (HEAD.format("binary_little_endian", 9) + "short", "expected 9 vertices, but got a file that ends"),
         (HEAD.format("ascii", 2) + "0 0 0\n1 1\n", "expected 6 finite numbers, but got 5 values"),
         (HEAD.format("ascii", 1).replace("float z", "list uchar int z") + "0", "vertices of plain numbers"),

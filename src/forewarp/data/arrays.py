@@ -36,9 +36,8 @@ class StoredDepth:
     def __call__(self) -> Tensor:
         """Read the depth; SceneError where the file holds anything else."""
         depth = read_gray16(self.path) if self.path.suffix == ".png" else load_numpy(self.path)
-        expected, shape = f"finite depths >= 0 of shape {self.size[::-1]}", getattr(depth, "shape", None)
-        if shape != self.size[::-1] or depth.dtype.kind not in "iuf":
-            raise mismatch(self.path, expected, f"shape {shape}")
+        expected = f"finite depths >= 0 of shape {self.size[::-1]}"
+        check_shape(depth, self.path, expected, *self.size[::-1])
         with np.errstate(over="ignore", invalid="ignore"):  # too large for float32: refused as infinite
             depth = np.array(depth * (1.0 if self.scale is None else self.scale), np.float32)
         if not np.isfinite(depth).all() or (depth < 0).any():
@@ -88,10 +87,8 @@ def read_cloud(path: Path, columns: int) -> np.ndarray:
         points = _obj_vertices(path, columns)
     else:
         points = _ply_places(path) if path.suffix == ".ply" else load_numpy(path)
-    shape, advice = getattr(points, "shape", ()), "export it again"
-    if len(shape) != 2 or shape[1] != columns or not shape[0] or points.dtype.kind not in "iuf":
-        got = f"shape {shape}" if hasattr(points, "shape") else "several arrays"
-        raise mismatch(path, f"points (N, {columns})", got, advice)
+    advice = "export it again"
+    check_shape(points, path, f"points (N, {columns})", None, columns, advice=advice)
     with np.errstate(over="ignore", invalid="ignore"):
         points = np.array(points, np.float32)
     bad = ~np.isfinite(points).all(1)
@@ -123,10 +120,10 @@ def _ply_places(path: Path) -> np.ndarray:
     properties = [line for line in vertices[1:] if line[:1] == ["property"] and len(line) > 2]
     columns = [(line[-1], _PLY_TYPES.get(line[1])) for line in properties]
     is_read = vertices[0][1:2] == ["vertex"] and vertices[0][-1].isdecimal() and order is not None
-    if not head.startswith(b"ply") or not is_read or not {"x", "y", "z"} <= dict(columns).keys():
-        raise mismatch(path, "a PLY whose first element is vertices with x, y, z", "another file")
-    if None in dict(columns).values() or len(dict(columns)) < len(columns):
-        raise mismatch(path, "vertices of plain numbers with different names", f"{columns}")
+    are_numbers = None not in dict(columns).values() and len(dict(columns)) == len(columns)
+    if not head.startswith(b"ply") or not is_read or not {*"xyz"} <= dict(columns).keys() or not are_numbers:
+        expected = "a PLY whose first element is vertices of plain numbers with different names, x, y, z too"
+        raise mismatch(path, expected, f"{columns}" if columns else "another file")
     count = int(vertices[0][-1])
     if order == "=":
         words = body.split()[: count * len(columns)]
@@ -155,6 +152,16 @@ def write_truth(path: Path, truth: Truth | None) -> None:
     points, times = np.asarray(truth.points, np.float32), np.asarray(truth.times, np.float64)
     with written_whole(path) as beside:
         np.savez(beside, points=points, times=times)
+
+
+def check_shape(values: object, where: object, expected: str, *shape: int | None, advice: str = "") -> None:
+    """Refuse what is no array of numbers of a shape, in which None is any length but 0."""
+    got = getattr(values, "shape", ())
+    fits = len(got) == len(shape) and all(n and n == (k or n) for n, k in zip(got, shape))
+    if not fits or values.dtype.kind not in "iuf":
+        raise mismatch(
+            where, expected, f"shape {got}" if hasattr(values, "shape") else "several arrays", advice
+        )
 
 
 def load_numpy(path: Path) -> np.ndarray | dict[str, np.ndarray]:

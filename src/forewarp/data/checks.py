@@ -32,12 +32,12 @@ _CUT_OFF, _FEW = 0.1, 0.5  # share of the subject beyond the box; of pixels and 
 _REMEDIES = {
     "nhr": ("mend the point clouds, or set data.box=[x0,y0,z0,x1,y1,z1]",) * 3,
     "hypernerf": ("mend {key} in scene.json", *("mend scene.json, or set data.box=null",) * 2),
+    "iphone": ("mend {key} in scene.json", *("mend scene.json, or set data.box=null",) * 2),
     "video_with_poses": (
         "set data.{key}, or mend the file's",
         "set data.box=null, or mend the file's aabb",
         "set data.box=null data.near=null data.far=null, or mend the file's aabb, near and far",
     ),
-    "iphone": ("mend {key} in scene.json", *("mend scene.json, or set data.box=null",) * 2),
     "": ("set data.{key}", "set data.box=null", "set data.box=null data.near=null data.far=null"),
 }
 
@@ -259,12 +259,9 @@ def check_seen(scene: Scene) -> None:
         return
     focus = focus_point([frame.camera for frame in scene.train]).tolist()
     near, far = (_length(scene, getattr(scene.train[0].camera, end)) for end in ("near", "far"))
-    raise mismatch(
-        f"{scene.name}: box, near, far",
-        "a box that cameras see between near and far",
-        f"{bounds(scene)}, near {near}, far {far}; cameras look at {_in_file(scene, focus)}",
-        _remedy(scene, "all"),
-    )
+    expected = "a box that cameras see between near and far"
+    got = f"{bounds(scene)}, near {near}, far {far}; cameras look at {_in_file(scene, focus)}"
+    raise mismatch(f"{scene.name}: box, near, far", expected, got, _remedy(scene, "all"))
 
 
 def blind_frames(scene: Scene, frames: Sequence[Frame] | None = None) -> int:

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from forewarp.data.arrays import load_numpy
+from forewarp.data.arrays import check_shape, load_numpy
 from forewarp.data.files import mismatch
 from forewarp.data.images import CACHE, by, read_gray16, read_image
 from forewarp.scene.camera import Camera, Lens
@@ -184,11 +184,8 @@ def read_depth(path: Path, *, signed: bool = False) -> np.ndarray:
         SceneError: for another shape, and for a depth below 0.
     """
     depth = read_gray16(path) if path.suffix == ".png" else load_numpy(path)
-    shape = getattr(depth, "shape", ())
-    if len(shape) == 3 and shape[2] == 1:
-        depth, shape = depth[..., 0], shape[:2]
-    if len(shape) != 2 or 0 in shape or depth.dtype.kind not in "iuf":
-        raise mismatch(path, "depths (H, W)", f"shape {shape}" if hasattr(depth, "shape") else "arrays")
+    depth = depth[..., 0] if getattr(depth, "shape", ())[2:] == (1,) else depth
+    check_shape(depth, path, "depths (H, W)", None, None)
     depth = np.array(depth, np.float64)
     depth[~np.isfinite(depth)] = np.nan if signed else 0
     if signed:
@@ -202,8 +199,7 @@ def _read_confidence(path: Path) -> np.ndarray:
     """Read confidences (H, W) in [0, 1]: levels and bytes are whole numbers."""
     values = read_image(path)[..., 0].numpy() if path.suffix == ".png" else load_numpy(path)
     values = values[..., 0] if getattr(values, "ndim", 0) == 3 else values
-    if getattr(values, "ndim", 0) != 2 or values.dtype.kind not in "iuf" or not values.size:
-        raise mismatch(path, "confidences (H, W)", f"shape {getattr(values, 'shape', ())}")
+    check_shape(values, path, "confidences (H, W)", None, None)
     most = 1.0 if values.dtype.kind == "f" else float(LEVELS if values.max() <= LEVELS else 255)
     if not (values.min() >= 0 and values.max() <= most):
         got = f"values from {values.min():g} to {values.max():g}"

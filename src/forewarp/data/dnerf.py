@@ -184,16 +184,15 @@ def _common(records: Sequence[_Record]) -> tuple[tuple[int, int], bool]:
     Raises:
         SceneError: naming an image that differs from the first in either.
     """
-    first = records[0]
-    for record in records:
-        size, expected = ((r.camera.width, r.camera.height) for r in (record, first))
-        if size != expected:
-            raise mismatch(record.path, f"{by(expected)} pixels as the first", by(size))
+    first, sizes = records[0], [(record.camera.width, record.camera.height) for record in records]
+    for record, size in zip(records, sizes):
+        if size != sizes[0]:
+            raise mismatch(record.path, f"{by(sizes[0])} pixels as the first", by(size))
     bare = [record for record in records if not record.has_alpha]
     if 0 < len(bare) < len(records):
         got = f"{len(bare)} of {len(records)} without, as {bare[0].path}"
         raise mismatch(first.path.parent, "an alpha channel in all images or in none", got)
-    return (first.camera.width, first.camera.height), not bare
+    return sizes[0], not bare
 
 
 def _read_records(

@@ -123,8 +123,8 @@ def read_scene(
     of_train, of_test = (part if split is None else f"{part}_{split}" for part in ("train", "val"))
     if split is not None or (folder / "splits" / "train.json").is_file():
         wheres = [folder / "splits" / f"{part}.json" for part in (of_train, of_test)]
-        train_ids, test_ids = (_names(where, "frame_names", read_json(where), ids) for where in wheres)
-        _check_apart(train_ids, test_ids, f"{wheres[1]}: frame_names", f"{of_train}.json")
+        train_ids = _names(wheres[0], "frame_names", read_json(wheres[0]), ids)
+        test_ids = _names(wheres[1], "frame_names", read_json(wheres[1]), ids, train_ids)
         how = f"splits/{of_train}.json and {of_test}.json"
     numbers, camera_ids, assumed = _read_items(folder / "metadata.json", ids)
     first, last = min(numbers.values()), max(numbers.values())
@@ -319,8 +319,8 @@ def _read_split(path: Path) -> tuple[str, list[str], list[str], list[str]]:
     ids = _names(path, "ids", content)
     if len(ids) > files.MOST_FRAMES:
         raise mismatch(f"{path}: ids", f"at most {files.MOST_FRAMES} items", len(ids))
-    train, val = (_names(path, key, content, ids) for key in ("train_ids", "val_ids"))
-    _check_apart(train, val, f"{path}: val_ids", "train_ids")
+    train = _names(path, "train_ids", content, ids)
+    val = _names(path, "val_ids", content, ids, train)
     if val and not train:
         raise mismatch(f"{path}: train_ids", "at least one beside val_ids", "none")
     if val:
@@ -332,8 +332,10 @@ def _read_split(path: Path) -> tuple[str, list[str], list[str], list[str]]:
     return "interpolation", ids, [ids[i] for i in chosen], [ids[i + _EVERY // 2] for i in chosen[:-1]]
 
 
-def _names(path: Path, key: str, content: dict, ids: list[str] | None = None) -> list[str]:
-    """Check the list ``key`` of a file: different names, of ``ids`` if given; else SceneError."""
+def _names(path: Path, key: str, content: dict, ids: list[str] | None = None, train=()) -> list[str]:
+    """Check the list ``key`` of a file: different names, of ``ids`` if given, none of ``train``; else
+    SceneError.
+    """
     names = content.get(key)
     are_names = isinstance(names, list) and all(isinstance(name, str) for name in names)
     if not are_names or len({*names}) < len(names):
@@ -341,12 +343,9 @@ def _names(path: Path, key: str, content: dict, ids: list[str] | None = None) ->
     known = {*names} if ids is None else {*ids}
     if unknown := [name for name in names if name not in known]:
         raise mismatch(f"{path}: {key}", "items of dataset.json's ids", short(unknown[0]), "list it in ids")
+    if both := {*train} & {*names}:
+        raise mismatch(f"{path}: {key}", "none of the items to train on", short(min(both)))
     return names
-
-
-def _check_apart(train: list[str], test: list[str], where: str, of_train: str) -> None:
-    if both := {*train} & {*test}:
-        raise mismatch(where, f"none of {of_train}", short(min(both)))
 
 
 def _read_keypoints(path: Path) -> Tensor:

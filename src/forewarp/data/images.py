@@ -8,7 +8,6 @@ import os
 import re
 import warnings
 import weakref
-from collections import OrderedDict
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -72,14 +71,14 @@ class ImageCache:
     """
 
     def __init__(self, limit: int) -> None:
-        self._kept: OrderedDict[int, tuple[weakref.ref, Tensor]] = OrderedDict()
+        self._kept: dict[int, tuple[weakref.ref, Tensor]] = {}
         self.bytes, self.limit = 0, limit
 
     def get(self, owner: object, make: Callable[[], Tensor]) -> Tensor:
         """Give what is kept for ``owner``, or make and keep it; treat it as read-only."""
         key = id(owner)
         if key in self._kept:
-            self._kept.move_to_end(key)
+            self._kept[key] = self._kept.pop(key)  # now the last to go
             return self._kept[key][1]
         with left_out():  # reading images is no training
             made = make()

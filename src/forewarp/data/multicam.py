@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from forewarp.data.arrays import load_numpy
+from forewarp.data.arrays import check_shape, load_numpy
 from forewarp.data.cameras import MOST_UNITS, box_of, number_or_none, pose_of, space_of
 from forewarp.data.directions import inverted, refuse_other_readings
 from forewarp.data.files import mismatch, number, one_of, scene_folder, whole
@@ -206,9 +206,7 @@ def _read_rows(path: Path, names: Sequence[str]) -> list[Camera]:
         SceneError: naming the row, or saying in which other way poses seem to be written.
     """
     array = load_numpy(path)
-    shape, advice = getattr(array, "shape", ()), "write them as LLFF does"
-    if len(shape) != 2 or shape[1] != 17 or array.dtype.kind not in "iuf":
-        raise mismatch(path, "17 numbers for each camera", f"shape {shape}", advice)
+    check_shape(array, path, "17 numbers for each camera", None, 17, advice="write them as LLFF does")
     if len(array) != len(names):
         expected = f"a row for each of {len(names)} cameras, {names[0]} to {names[-1]}"
         advice = "remove the row or the camera that the other lacks"

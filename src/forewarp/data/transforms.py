@@ -396,11 +396,9 @@ def times_of(names: list[str], times: Sequence[float | None], where: str) -> tup
         raise mismatch(f"{where}: frames: time", "one in all frames or in none", got)
     numbers = numbers_in(names)
     if numbers is None:
-        order = in_order(range(len(names)), lambda i: names[i])
-        ranks = {i: rank for rank, i in enumerate(order)}
-        last = max(len(names) - 1, 1)
+        order, last = in_order(range(len(names)), lambda i: names[i]), max(len(names) - 1, 1)
         line = f"{where}: no time in the frames: spread evenly in the order of the images' names"
-        return [ranks[i] / last for i in range(len(names))], line
+        return [rank / last for rank in np.argsort(order).tolist()], line
     first, last = min(numbers), max(numbers)
     line = f"{where}: no time in the frames: taken from the numbers in the images' names, {first} to {last}"
     if len(set(numbers)) < len(numbers):

@@ -180,9 +180,7 @@ class Camera:
             pixels: flat indices (R,) into the row-major image, or None for all H*W.
             dtype: dtype of the result.
         """
-        if pixels is None:
-            pixels = torch.arange(self.width * self.height)
-        pixels = torch.as_tensor(pixels)
+        pixels = torch.arange(self.width * self.height) if pixels is None else torch.as_tensor(pixels)
         u = (pixels % self.width).double() + 0.5
         v = torch.div(pixels, self.width, rounding_mode="floor").double() + 0.5
         directions = self.directions(u, v)

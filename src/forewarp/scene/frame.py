@@ -71,8 +71,9 @@ class Scene:
     """All frames of one subject, read once.
 
     ``box`` bounds everything visible; ``canonical_time`` in [0, 1]; ``has_alpha``: the images separate
-    foreground from background; ``protocol`` says how numbers are measured, less what is None; ``still`` (N, 3) float32: points
-    that never move, world units, if known; ``held``: held-out frames, never trained on.
+    foreground from background; ``protocol`` says how numbers are measured, entries of None are left out;
+    ``still`` (N, 3) float32: points that never move, world units, if known; ``held``: held-out frames, never
+    trained on.
     """
 
     name: str
