@@ -37,9 +37,10 @@ After Ctrl-C the same command goes on.
 from __future__ import annotations
 
 import importlib.util
+from functools import partial
 from pathlib import Path
 
-from forewarp.cli.entry import console_script
+from forewarp.cli.entry import command
 from forewarp.data.files import one_of, whole
 from forewarp.files import check_replaceable
 from forewarp.runs.config import check_seed
@@ -144,4 +145,7 @@ def check(config) -> tuple[dict, object]:
     return source, out
 
 
-main = console_script(__name__)
+main = partial(command, "capture", capture, __doc__)
+
+if __name__ == "__main__":
+    main()

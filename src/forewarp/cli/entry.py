@@ -27,20 +27,7 @@ MISTAKE, INTERRUPTED = 2, 130
 _MMAP_THRESHOLD, _TRIM_THRESHOLD = -3, -1  # of mallopt, in glibc's malloc.h
 
 
-def console_script(module: str, config: str | None = None) -> Callable[[], None]:
-    """Make the console script of a module whose function of its own name is the task, and whose docstring the
-    help; ``config`` names the config file if it is not of this name.
-    """
-
-    def main() -> None:
-        """Run the console script."""
-        code, name = sys.modules[module], module.rpartition(".")[2]
-        command(name, getattr(code, name), code.__doc__, config or name)
-
-    return main
-
-
-def command(name: str, task: Callable, text: str, config: str) -> None:
+def command(name: str, task: Callable, text: str, *, config: str | None = None) -> None:
     """Run a console script: compose ``conf/<config>.yaml`` with the command line and call ``task`` with it.
 
     Never returns. The exit status is 0; 2 after a mistake of the user's, which is told in one line; 1 after a
@@ -50,8 +37,9 @@ def command(name: str, task: Callable, text: str, config: str) -> None:
         name: the command's name after ``forewarp-``.
         task: takes the composed config.
         text: the beginning of ``--help``.
-        config: the config file's name.
+        config: the config file's name if it is another.
     """
+    config = config or name
     quiet()
     try:
         if {"-h", "--help"} & set(sys.argv[1:]):

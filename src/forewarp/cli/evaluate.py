@@ -19,7 +19,9 @@ What one types most:
 
 from __future__ import annotations
 
-from forewarp.cli.entry import console_script
+from functools import partial
+
+from forewarp.cli.entry import command
 from forewarp.cli.prepare import refuse_numbers
 
 
@@ -48,4 +50,7 @@ def evaluate(config) -> None:
         measure_run(run, module, saved)
 
 
-main = console_script(__name__)
+main = partial(command, "evaluate", evaluate, __doc__)
+
+if __name__ == "__main__":
+    main()

@@ -33,9 +33,10 @@ What one types most:
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
-from forewarp.cli.entry import console_script
+from forewarp.cli.entry import command
 
 
 def export(config) -> None:
@@ -148,4 +149,7 @@ def check(config, windows: int = 1) -> list[float]:
     return [float(time) for time in times]
 
 
-main = console_script(__name__)
+main = partial(command, "export", export, __doc__)
+
+if __name__ == "__main__":
+    main()

@@ -15,7 +15,9 @@ Overrule a plan by an override: forewarp-train plan=FILE model/view_dependence=n
 
 from __future__ import annotations
 
-from forewarp.cli.entry import console_script
+from functools import partial
+
+from forewarp.cli.entry import command
 
 
 def plan(config) -> None:
@@ -53,4 +55,7 @@ def planned():
     return config
 
 
-main = console_script(__name__, "train")
+main = partial(command, "plan", plan, __doc__, config="train")
+
+if __name__ == "__main__":
+    main()

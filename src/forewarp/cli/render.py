@@ -27,9 +27,10 @@ What one types most:
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 
-from forewarp.cli.entry import console_script
+from forewarp.cli.entry import command
 
 HALF = 0.5  # share of a pixel, above which it counts as what fills it
 LEAST_SIZE = 400  # pixels of the longer side, unless size= asks for another
@@ -119,4 +120,7 @@ def check(config) -> None:
     refuse_numbers(config, *LEAST, *RANGES)
 
 
-main = console_script(__name__)
+main = partial(command, "render", render, __doc__)
+
+if __name__ == "__main__":
+    main()

@@ -38,13 +38,14 @@ make reproduce-tables [DATA=DATASETS], make ablations, make effects. Runs withou
 from __future__ import annotations
 
 from contextlib import suppress
+from functools import partial
 from glob import glob
 from pathlib import Path
 from pkgutil import resolve_name
 
 from omegaconf import DictConfig, OmegaConf
 
-from forewarp.cli.entry import console_script
+from forewarp.cli.entry import command
 from forewarp.cli.mistakes import one_line
 from forewarp.cli.render import write_film
 from forewarp.data.files import number, one_of
@@ -184,4 +185,7 @@ def _render(config: DictConfig, row: dict, media) -> None:
     media.video, media.about = write_film(film, run, module), FILMS[film.path]
 
 
-main = console_script(__name__)
+main = partial(command, "report", report, __doc__)
+
+if __name__ == "__main__":
+    main()

@@ -32,7 +32,9 @@ Train on it: forewarp-train data=dnerf data.root=scenes data.scene=large
 
 from __future__ import annotations
 
-from forewarp.cli.entry import console_script
+from functools import partial
+
+from forewarp.cli.entry import command
 
 
 def synthesize(config) -> None:
@@ -64,4 +66,7 @@ def synthesize(config) -> None:
     print(f"written: {folder}")
 
 
-main = console_script(__name__)
+main = partial(command, "synthesize", synthesize, __doc__)
+
+if __name__ == "__main__":
+    main()

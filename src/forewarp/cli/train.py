@@ -54,9 +54,10 @@ Watch: tensorboard --logdir runs
 from __future__ import annotations
 
 import re
+from functools import partial
 from shlex import quote
 
-from forewarp.cli.entry import console_script
+from forewarp.cli.entry import command
 
 # Of a profiler's table: action, calls, seconds in all. The row of the total has no mean.
 _ROW = re.compile(r"^\|\s+(\S.*?)\s*\|\s+\d\S*\s*\|\s+(\d+)\s*\|\s+(\d\S*)\s*\|", re.M)
@@ -155,4 +156,7 @@ def images_of(frames, kind: str) -> str:
     return f"{len(frames)} {kind} images" + (f" ({size})" if size else "")
 
 
-main = console_script(__name__)
+main = partial(command, "train", train, __doc__)
+
+if __name__ == "__main__":
+    main()

@@ -20,10 +20,11 @@ A run in training: forewarp-train ... viewer=true
 
 from __future__ import annotations
 
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 
-from forewarp.cli.entry import console_script
+from forewarp.cli.entry import command
 
 TOLERANCE = 1e-3  # by which two runs' test cameras may differ, of their distance to the origin
 
@@ -94,4 +95,7 @@ def refuse_other_scene(scene, other) -> None:
         raise ValueError(f"{expected}, but got one with other test views")
 
 
-main = console_script(__name__)
+main = partial(command, "view", view, __doc__)
+
+if __name__ == "__main__":
+    main()
