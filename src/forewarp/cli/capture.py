@@ -37,7 +37,6 @@ After Ctrl-C the same command goes on.
 from __future__ import annotations
 
 import importlib.util
-from functools import partial
 from pathlib import Path
 
 from forewarp.cli.entry import command
@@ -145,7 +144,10 @@ def check(config) -> tuple[dict, object]:
     return source, out
 
 
-main = partial(command, "capture", capture, __doc__)
+def main() -> None:
+    """Run the console script."""
+    command("capture", capture, __doc__)
+
 
 if __name__ == "__main__":
     main()

@@ -19,8 +19,6 @@ What one types most:
 
 from __future__ import annotations
 
-from functools import partial
-
 from forewarp.cli.entry import command
 from forewarp.cli.prepare import refuse_numbers
 
@@ -50,7 +48,10 @@ def evaluate(config) -> None:
         measure_run(run, module, saved)
 
 
-main = partial(command, "evaluate", evaluate, __doc__)
+def main() -> None:
+    """Run the console script."""
+    command("evaluate", evaluate, __doc__)
+
 
 if __name__ == "__main__":
     main()

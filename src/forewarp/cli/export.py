@@ -33,7 +33,6 @@ What one types most:
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 from forewarp.cli.entry import command
@@ -149,7 +148,10 @@ def check(config, windows: int = 1) -> list[float]:
     return [float(time) for time in times]
 
 
-main = partial(command, "export", export, __doc__)
+def main() -> None:
+    """Run the console script."""
+    command("export", export, __doc__)
+
 
 if __name__ == "__main__":
     main()

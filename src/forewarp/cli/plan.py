@@ -15,8 +15,6 @@ Overrule a plan by an override: forewarp-train plan=FILE model/view_dependence=n
 
 from __future__ import annotations
 
-from functools import partial
-
 from forewarp.cli.entry import command
 
 
@@ -55,7 +53,10 @@ def planned():
     return config
 
 
-main = partial(command, "plan", plan, __doc__, config="train")
+def main() -> None:
+    """Run the console script."""
+    command("plan", plan, __doc__, config="train")
+
 
 if __name__ == "__main__":
     main()

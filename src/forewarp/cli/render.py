@@ -27,7 +27,6 @@ What one types most:
 
 from __future__ import annotations
 
-from functools import partial
 from pathlib import Path
 
 from forewarp.cli.entry import command
@@ -120,7 +119,10 @@ def check(config) -> None:
     refuse_numbers(config, *LEAST, *RANGES)
 
 
-main = partial(command, "render", render, __doc__)
+def main() -> None:
+    """Run the console script."""
+    command("render", render, __doc__)
+
 
 if __name__ == "__main__":
     main()

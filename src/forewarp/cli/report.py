@@ -38,7 +38,6 @@ make reproduce-tables [DATA=DATASETS], make ablations, make effects. Runs withou
 from __future__ import annotations
 
 from contextlib import suppress
-from functools import partial
 from glob import glob
 from pathlib import Path
 from pkgutil import resolve_name
@@ -185,7 +184,10 @@ def _render(config: DictConfig, row: dict, media) -> None:
     media.video, media.about = write_film(film, run, module), FILMS[film.path]
 
 
-main = partial(command, "report", report, __doc__)
+def main() -> None:
+    """Run the console script."""
+    command("report", report, __doc__)
+
 
 if __name__ == "__main__":
     main()

@@ -32,8 +32,6 @@ Train on it: forewarp-train data=dnerf data.root=scenes data.scene=large
 
 from __future__ import annotations
 
-from functools import partial
-
 from forewarp.cli.entry import command
 
 
@@ -66,7 +64,10 @@ def synthesize(config) -> None:
     print(f"written: {folder}")
 
 
-main = partial(command, "synthesize", synthesize, __doc__)
+def main() -> None:
+    """Run the console script."""
+    command("synthesize", synthesize, __doc__)
+
 
 if __name__ == "__main__":
     main()

@@ -54,7 +54,6 @@ Watch: tensorboard --logdir runs
 from __future__ import annotations
 
 import re
-from functools import partial
 from shlex import quote
 
 from forewarp.cli.entry import command
@@ -156,7 +155,10 @@ def images_of(frames, kind: str) -> str:
     return f"{len(frames)} {kind} images" + (f" ({size})" if size else "")
 
 
-main = partial(command, "train", train, __doc__)
+def main() -> None:
+    """Run the console script."""
+    command("train", train, __doc__)
+
 
 if __name__ == "__main__":
     main()

@@ -20,7 +20,6 @@ A run in training: forewarp-train ... viewer=true
 
 from __future__ import annotations
 
-from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -95,7 +94,10 @@ def refuse_other_scene(scene, other) -> None:
         raise ValueError(f"{expected}, but got one with other test views")
 
 
-main = partial(command, "view", view, __doc__)
+def main() -> None:
+    """Run the console script."""
+    command("view", view, __doc__)
+
 
 if __name__ == "__main__":
     main()
