@@ -5,7 +5,6 @@ What is wrong with a command by itself is refused before torch is loaded, so a m
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
@@ -26,9 +25,16 @@ if TYPE_CHECKING:  # loads torch
     from forewarp.runs.fitted import Score
     from forewarp.training.stages import Run
 
-# What our data modules read; those of others, and those that make their scene, check for themselves.
-READERS = {"DNeRF": "dnerf", "LegoComplete": "lego_complete", "HyperNeRF": "hypernerf", "NHR": "nhr"}
-READERS |= {"Multicam": "multicam", "PosedVideo": "posed_video"}
+# The file that every scene of our data modules has; those of others, and those that make their scene, check
+# for themselves.
+MARKERS = {
+    "DNeRFDataModule": "transforms_train.json",
+    "LegoCompleteDataModule": "transforms_train.json",
+    "HyperNeRFDataModule": "dataset.json",
+    "NHRDataModule": "CamPose.inf",
+    "MulticamDataModule": "poses_bounds.npy",
+    "PosedVideoDataModule": "transforms.json",
+}
 VOXELS, PARTICLES = "forewarp.methods.voxel.", "forewarp.methods.particles."
 
 CHOICES = {"effects": ("given", "auto"), "absent": ("refuse", "skip")}
@@ -151,9 +157,9 @@ def refuse_missing_scene(config: DictConfig) -> None:
     Raises:
         SceneError: listing the scenes that are there.
     """
-    ours = re.fullmatch(r"forewarp\.data\.module\.(\w+)DataModule", str(config.data.get("_target_")))
-    if ours and ours[1] in READERS and config.get("absent", "refuse") == "refuse":
-        scene_folder(Path(config.data.root).expanduser(), str(config.data.scene), READERS[ours[1]])
+    marker = MARKERS.get(str(config.data.get("_target_")).removeprefix("forewarp.data.module."))
+    if marker is not None and config.get("absent", "refuse") == "refuse":
+        scene_folder(Path(config.data.root).expanduser(), str(config.data.scene), marker)
 
 
 def refuse_missing_start(config: DictConfig) -> None:
