@@ -47,7 +47,7 @@ def some_points(count=200, seed=3, dtype=torch.float32):
 def shown(made, time, points=None):
     """Density and colour at some points."""
     points = some_points() if points is None else points
-    density, color = made.field(Moment(time)).at(points)
+    density, color = made.field(Moment(time)).at_world(points)
     return density, color(slice(None), TOWARDS.expand(len(points), 3))
 
 
@@ -79,7 +79,7 @@ def test_the_camera_changes_colour_only():
     made, points, towards = method("tineuvox", camera=True), some_points(), TOWARDS.expand(200, 3)
     made.cameras = [0, 1]
     fields = [made.field(Moment(0.5, camera=camera)) for camera in (0, 1, None, 7)]
-    density, color_of = zip(*(field.at(points) for field in fields))
+    density, color_of = zip(*(field.at_world(points) for field in fields))
     colors = [color(slice(None), towards) for color in color_of]
     assert density[0].equal(density[1])
     assert not colors[0].equal(colors[1])
@@ -107,7 +107,7 @@ def test_ndvg_starts_half_hidden_and_unmoved(alpha, opaque):
     made, pictures = method("ndvg", numbers={"alpha_init": alpha}), []
     for time in (0.0, 0.3):
         field = made.field(Moment(time))
-        density, _ = field.at(some_points())
+        density, _ = field.at_world(some_points())
         offset, mask = field.offset(some_points())
         assert not offset.any()
         assert mask.eq(0.5).all()
@@ -153,7 +153,7 @@ def test_offsets_of_ndvg_lead_to_the_canonical_time(continuous):
         moved = torch.zeros(3) if continuous else shift
         assert field.offset(points)[0].allclose(moved.expand(200, 3))
         assert not rest.offset(points)[0].any()
-        torch.testing.assert_close(field.at(points - moved)[0], rest.at(points)[0])
+        torch.testing.assert_close(field.at_world(points - moved)[0], rest.at_world(points)[0])
         made.network[-1].weight.normal_(std=0.1)
         near, far = (made.field(Moment(t)).offset(points)[0].norm(dim=-1).mean() for t in (1e-6, 1.0))
     assert float(far) > 2e-3
@@ -324,7 +324,7 @@ def test_gradcheck(kind):
     values = [parameter for grid in grids for parameter in grid.parameters()]
 
     def look(points, last, *_):
-        density, color = made.field(Moment(0.7)).at(points)
+        density, color = made.field(Moment(0.7)).at_world(points)
         return density, color(torch.arange(4), TOWARDS.double().expand(4, 3))
 
     points = (0.4 * some_points(4, dtype=torch.float64) + 0.013).requires_grad_()

@@ -104,7 +104,7 @@ def of_warp(method):
 
 def of_grids(method):
     field = method.field(Moment(0.5, camera=0))
-    density, color = field.at(POINTS)
+    density, color = field.at_world(POINTS)
     opacity = -torch.expm1(-density * 0.5 * method.activation.density_scale)
     return {"opacity": opacity, "color": color(slice(None), DIRECTIONS)}
 

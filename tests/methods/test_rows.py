@@ -45,6 +45,14 @@ def test_rows_of_parts_are_taken_with_their_moments():
     assert torch.equal(optimizer.state[held]["exp_avg"], moment[rows] * torch.tensor([[1.0], [1.0], [0.0]]))
 
 
+@pytest.mark.parametrize("rows", [[-1], [4], [0.5], [True]])
+def test_rows_that_there_are_not_are_refused(rows):
+    method, optimizer = stepped()
+    with pytest.raises(ValueError, match=r"rows: expected int64 in \[0, 4\), but got"):
+        take_rows(method, optimizer, torch.tensor(rows))
+    assert len(method.points.place) == 4
+
+
 def test_a_state_of_other_rows_is_adopted_and_one_that_contradicts_itself_is_named():
     method, state = Method4(), Method4().state_dict()
     more = {name: torch.cat([value, value]) for name, value in state.items()}

@@ -98,10 +98,10 @@ def test_end_point_refusals():
     broken = predicted.clone()
     broken[2, 1, 0] = math.nan
     for points, true, match in (
-        (predicted[:, :1], truth[:, :1], r"points: expected finite \(N, T, 3\).* but got shape \(7, 1, 3\)"),
-        (predicted[:0], truth[:0], r"points: expected finite .* but got shape \(0, 4, 3\)"),
-        (predicted[:, 1:], truth, r"predicted_points: expected shape \(7, 4, 3\), but got \(7, 3, 3\)"),
-        (broken, truth, r"points: expected finite .*, 1 NaN or infinite"),
+        (predicted[:, :1], truth[:, :1], r"truth: expected N >= 1 and T >= 2, but got shape \(7, 1, 3\)"),
+        (predicted[:0], truth[:0], r"truth: expected .* but got shape \(0, 4, 3\)"),
+        (predicted[:, 1:], truth, r"predicted: expected shape \(7, 4, 3\), but got \(7, 3, 3\)"),
+        (broken, truth, r"predicted: expected finite places, but got 1 of 84"),
     ):
         with pytest.raises(ValueError, match=match):
             end_point_error(points, true)

@@ -78,7 +78,7 @@ def check_option(key: str, value: object) -> None:
         whole = key in WHOLE_NUMBERS
         least, most = WHOLE_NUMBERS[key] if whole else NUMBERS[key]
         good = type(value) in ((int,) if whole else (int, float)) and least <= value <= most
-        expected = f"a {'whole ' * whole}number from {least} to {most}"
+        expected = f"a {'whole number' if whole else 'number'} from {least} to {most}"
     if not good:
         raise ValueError(f"{key}: expected {expected}, but got {value}")
 

@@ -37,13 +37,22 @@ class Curve:
     """
 
     def __init__(
-        self, kind: str, count: int, times: int, canonical_time: float, *, straight=False, exactly=False
+        self,
+        kind: str,
+        count: int,
+        times: int,
+        canonical_time: float,
+        *,
+        straight: bool = False,
+        exactly: bool = False,
     ) -> None:
-        self.kind, self.count, self.times, self.canonical_time = kind, count, times, canonical_time
+        self.kind, self.times, self.canonical_time = kind, times, canonical_time
         self.straight = straight and kind == "spline"
-        if kind == "cosines" and not exactly:
+        if exactly:
+            self.count = count
+        elif kind == "cosines":
             self.count = max(1, min(count, times - 1))
-        elif not exactly:
+        else:
             self.count = max(min(times, 4), count - 2) if straight else max(4, count)
 
     @property

@@ -57,7 +57,7 @@ class Buffer:
 
     def add(
         self,
-        values: Tensor | np.ndarray | Sequence[float],
+        values: Tensor | np.ndarray | Sequence[float] | None,
         component: Component = FLOAT,
         *,
         bounds: bool = False,
@@ -67,8 +67,8 @@ class Buffer:
         """Add an array (N,), (N, 3) or (N, 4); return the number of its accessor.
 
         Args:
-            values: the numbers that are stored: of a normalised component, whole ones; of a filter, what it
-                makes of its elements instead.
+            values: the numbers that are stored: of a normalised component, whole ones; None beside
+                ``filtered``, whose filter makes them.
             component: how they are stored.
             bounds: whether the accessor says the least and the greatest values.
             vertices: whether it is an attribute of vertices, whose rows begin at multiples of 4 bytes.

@@ -179,7 +179,7 @@ class _Store(Buffer):
     def _exponential(self, values: np.ndarray, exponents: np.ndarray | int, **options) -> int:
         if self.compressed:
             elements = meshopt.exponential(values.reshape(len(values), -1), exponents)
-            options["filtered"] = "EXPONENTIAL", elements
+            return self.add(None, filtered=("EXPONENTIAL", elements), **options)
         return self.add(values, **options)
 
     def quaternions(self, values: np.ndarray, bits: int, **options) -> int:
@@ -187,7 +187,7 @@ class _Store(Buffer):
         if not self.compressed:
             return self.add(values, **options)
         return self.add(
-            values, SIGNED_SHORT, filtered=("QUATERNION", meshopt.quaternion(values, bits)), **options
+            None, SIGNED_SHORT, filtered=("QUATERNION", meshopt.quaternion(values, bits)), **options
         )
 
     def shares(self, values: np.ndarray, **options) -> int:

@@ -261,7 +261,7 @@ class NDVGField(PointField):
             offset = offset - method.carried(points, method.canonical_time)[0]
         return offset, torch.sigmoid(hidden)
 
-    def at(self, points: Tensor) -> tuple[Tensor, Callable]:
+    def at_world(self, points: Tensor) -> tuple[Tensor, Callable]:
         """See ``PointField``. The density is the one whose opacity over a step is the masked one."""
         method, canonical = self.method, self.method.canonical
         self.points = points

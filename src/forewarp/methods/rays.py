@@ -307,7 +307,7 @@ class SampledMethod(RayMethod):
         self.dead_start.look(all(bool((rendering.density > 0).any()) for rendering in passes))
         terms = self.extra_terms(seen, batch, generator)
         if "coarse_photo" in self.terms:
-            terms["coarse_photo"] = lambda: seen.coarse and (seen.coarse.rgb - rgb).square().mean()
+            terms = {**terms, "coarse_photo": lambda: seen.coarse and (seen.coarse.rgb - rgb).square().mean()}
         tensors = {"density": seen.density, "weights": seen.weights, "rgb": seen.rgb}
         return self.compared(seen, rgb, terms, tensors, samples=seen.depths.numel())
 
@@ -419,7 +419,7 @@ class Marching:
 
 
 class PointField:
-    """A method at one moment. A subclass says what is ``at`` world points; the renderer asks for it in
+    """A method at one moment. A subclass says what is ``at_world`` points; the renderer asks for it in
     coordinates of the ``lattice`` whose ``cells`` are marched: those that may hold matter.
     """
 
@@ -430,15 +430,15 @@ class PointField:
         self.lattice = Lattice(method.box, tuple(n + 1 for n in self.cells.shape))
         self.voxel_size = method.lattice_marched.voxel_size
 
-    def at(self, points: Tensor) -> tuple[Tensor, Callable]:
+    def at_world(self, points: Tensor) -> tuple[Tensor, Callable]:
         """World points (P, 3) -> density (P,) per world unit, and a function: rows (K,) of these points and
         unit directions (K, 3) -> colour (K, 3).
         """
         raise NotImplementedError
 
     def look_up(self, points: Tensor) -> tuple[Tensor, Callable]:
-        """See ``at``, for points in lattice coordinates."""
-        return self.at(self.lattice.to_world(points))
+        """See ``at_world``, for points in lattice coordinates."""
+        return self.at_world(self.lattice.to_world(points))
 
 
 class MarchedMethod(RayMethod):
@@ -571,7 +571,7 @@ class MarchedMethod(RayMethod):
 
     def density_at(self, points: Tensor, time: float) -> Tensor:
         """World points (P, 3) and a time -> density (P,), per world unit."""
-        return self.field(Moment(time)).at(points)[0]
+        return self.field(Moment(time)).at_world(points)[0]
 
     def optimizer(self, groups: list[dict]) -> torch.optim.Optimizer:
         """Make Adam with the published betas; voxels that no sample touched keep their moments."""

@@ -18,9 +18,16 @@ def keep_rows(method: nn.Module, rows: Tensor) -> tuple[list[Parameter], list[Pa
     Returns:
         the parameters before and after, pairwise.
 
+    Raises:
+        ValueError: for rows out of range.
+
     Cost: one copy of each.
     """
     before, after = [], []
+    count = len(part_of(method, method.grows[0]))
+    if rows.dtype != torch.int64 or (len(rows) and not 0 <= int(rows.min()) <= int(rows.max()) < count):
+        got = f"{rows.dtype}: {rows[:5].tolist()} ..."
+        raise ValueError(f"rows: expected int64 in [0, {count}), but got {got}")
     for name in method.grows:
         place, _, last = name.rpartition(".")
         owner, value = method.get_submodule(place), part_of(method, name)
@@ -48,6 +55,9 @@ def take_rows(
         optimizer: the optimizer whose moments follow.
         rows: (N',) int64, each in [0, N).
         fresh: (N',) bool, rows whose moments start at 0; None: every row keeps the moments of its source.
+
+    Raises:
+        ValueError: for rows out of range.
 
     Cost: one copy of each parameter and of its moments.
     """

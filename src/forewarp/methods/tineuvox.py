@@ -102,6 +102,9 @@ class TiNeuVox(MarchedMethod):
 
     def read(self, points: Tensor) -> Tensor:
         """World points (P, 3) -> features (P, 3 C) at the three strides; 0 outside the box."""
+        shape = self.grid.lattice.shape
+        if not self.padded and any((n - 1) % max(_STRIDES) for n in shape):
+            raise ValueError(f"model.padded: expected true for a grid of sizes {shape}, but got false")
         return read_strided(self.grid, points, _STRIDES)
 
     def code(self, network: nn.Module, number: float) -> Tensor:
@@ -170,7 +173,7 @@ class TiNeuVoxField(PointField):
         """``[PE(x), tau]`` (P, I)."""
         return torch.cat([self.method.position(points), self.tau.expand(len(points), -1)], -1)
 
-    def at(self, points: Tensor) -> tuple[Tensor, Callable]:
+    def at_world(self, points: Tensor) -> tuple[Tensor, Callable]:
         """See ``PointField``."""
         method, placed = self.method, self._placed(points)
         read = method.feature(method.read(points + method.offsets(placed)))

@@ -80,12 +80,15 @@ def end_point_error(
     >>> scores["epe_moving"], scores["epe_still"], scores["motion_mean"]
     (1.0, 0.0, 1.0)
     """
-    check_shapes("true_points (N, T, 3), predicted_points (N, T, 3)", truth, predicted)
+    check_shapes("truth (N, T, 3), predicted (N, T, 3)", truth, predicted)
+    if len(truth) < 1 or truth.shape[1] < 2:
+        raise ValueError(f"truth: expected N >= 1 and T >= 2, but got shape {tuple(truth.shape)}")
+    for name, points in (("predicted", predicted), ("truth", truth)):
+        if bad := int((~torch.isfinite(points)).sum()):
+            raise ValueError(
+                f"{name}: expected finite places, but got {bad} of {points.numel()} NaN or infinite"
+            )
     predicted, truth = predicted.detach().cpu().double(), truth.cpu().double()
-    wrong = int((~torch.isfinite(predicted - truth)).sum())
-    if len(truth) < 1 or truth.shape[1] < 2 or wrong:
-        got = f"shape {tuple(truth.shape)}, {wrong} NaN or infinite"
-        raise ValueError(f"points: expected finite (N, T, 3) with N >= 1 and T >= 2, but got {got}")
     if moving_threshold is None:
         canonical = truth[:, 0]
         moving_threshold = MOVING_FRACTION * float((canonical.amax(0) - canonical.amin(0)).norm())

@@ -41,11 +41,15 @@ def image_pair(prediction: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
     """
     check_shapes("target (H, W, 3), prediction (H, W, 3)", target, prediction)
     for name, image, slack in (("prediction", prediction, 1.0), ("target", target, 1e-3)):
-        if not image.is_floating_point() or not image.numel():
-            got = f"{image.dtype} of shape {tuple(image.shape)}"
-            raise ValueError(f"{name}: expected floats in [0, 1], but got {got}; divide by 255")
-        low, high = float(image.min()), float(image.max())  # NaN where there is one
-        if not (low >= -slack and high <= 1 + slack):
+        if not image.numel():
+            raise ValueError(f"{name}: expected pixels, but got shape {tuple(image.shape)}")
+        if not image.is_floating_point():
+            raise ValueError(f"{name}: expected floats in [0, 1], but got {image.dtype}; divide by 255")
+        if bad := int((~torch.isfinite(image)).sum()):
+            got = f"{bad} of {image.numel()} NaN or infinite"
+            raise ValueError(f"{name}: expected finite values, but got {got}")
+        low, high = float(image.min()), float(image.max())
+        if low < -slack or high > 1 + slack:
             raise ValueError(f"{name}: expected values in [0, 1], but got [{low:.4g}, {high:.4g}]")
     return quantise(prediction), quantise(target)
 

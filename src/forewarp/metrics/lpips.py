@@ -196,11 +196,14 @@ def _load_backbone(features: nn.Sequential, file: Path, net: str) -> None:
     what = f"weights of {net}'s features"
     try:
         stored = torch.load(file, map_location="cpu", weights_only=True)
-        state, wanted = {key.removeprefix("features."): stored[key] for key in stored}, features.state_dict()
-        features.load_state_dict({key: state[key] for key in wanted if key in state})
-    except (OSError, EOFError, pickle.UnpicklingError) as error:
+    except (OSError, RuntimeError, EOFError, pickle.UnpicklingError) as error:
         raise ValueError(f"{file}: expected {what}, but got {type(error).__name__} on reading") from error
-    except (RuntimeError, AttributeError, TypeError) as error:
+    if not isinstance(stored, dict) or not all(isinstance(value, Tensor) for value in stored.values()):
+        raise ValueError(f"{file}: expected {what}, but got a {type(stored).__name__} of other things")
+    state = {str(key).removeprefix("features."): value for key, value in stored.items()}
+    try:
+        features.load_state_dict({key: state[key] for key in features.state_dict() if key in state})
+    except RuntimeError as error:  # PyTorch names what is missing or of another shape
         got = " ".join(str(error).split())
         raise ValueError(f"{file}: expected {what}, but got others: {got}") from error
 

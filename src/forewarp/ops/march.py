@@ -160,7 +160,7 @@ def march(
     _check_march(*rays)
     if not use_numba(origins):
         return march_reference(*rays)
-    found = _marched(rays, None, None, 0.0, 0.0, 0.0, 0.0, 0.0)
+    found = _marched(rays)
     return found.ray_ids, found.distances
 
 
@@ -252,23 +252,33 @@ def trace(
     _check_march(*rays)
     sizes = {axis: n + 1 for axis, n in zip("XYZ", cells.shape)}
     check_shapes("raw (M), index (X, Y, Z)", raw, index, **sizes)
-    return _marched(rays, raw, index, fill, shift, scale, early_stop_eps, threshold)
+    return _marched(rays, (raw, index), fill, shift, scale, early_stop_eps, threshold)
 
 
-def _marched(rays: tuple, raw: Tensor | None, index: Tensor | None, *numbers: float) -> Traced:
-    """Call the kernel twice: to count each ray's samples, and to write them. See ``trace``; a ``raw`` of None
-    has no density, and each sample a weight of 1.
+def _marched(
+    rays: tuple,
+    field: tuple[Tensor, Tensor] | None = None,
+    fill: float = 0.0,
+    shift: float = 0.0,
+    scale: float = 0.0,
+    early_stop_eps: float = 0.0,
+    threshold: float = 0.0,
+) -> Traced:
+    """Call the kernel twice: to count each ray's samples, and to write them. See ``trace``; ``field`` is raw
+    and index, without which samples hide nothing, and have no weights.
     """
     from forewarp.ops.kernels import voxels as kernels
 
     origins, *_ = rays
     sums = torch.zeros(len(origins), 4, dtype=torch.float64)
     read, counts, firsts = torch.zeros(3, len(origins), dtype=torch.int64).unbind()
-    field = (None, None) if raw is None else arrays(raw, index)
-    common = (*_march_arrays(*rays), *field, *map(float, numbers), *arrays(sums, read, counts, firsts))
+    numbers = map(float, (fill, shift, scale, early_stop_eps, threshold))
+    common = (*_march_arrays(*rays), *((None, None) if field is None else arrays(*field)), *numbers)
+    common += arrays(sums, read, counts, firsts)
     kernels.march(*common, *arrays(counts[:0], counts[:0], origins[:0, 0], origins[:0, 0]))
     starts, total = counts.cumsum(0) - counts, int(counts.sum())
-    ids, distances, weights = counts.new_empty(total), *origins.new_empty(2, total).unbind()
+    ids, distances = counts.new_empty(total), origins.new_empty(total)
+    weights = distances[:0] if field is None else torch.empty_like(distances)
     kernels.march(*common, *arrays(starts, ids, distances, weights))
     opacity, distance, transmittance, _ = sums.to(origins.dtype).unbind(-1)
     return Traced(opacity, distance, transmittance, ids, distances, weights, int(read.sum()))

@@ -4,7 +4,8 @@ Numba does not make vectors of a loop that has branches. Here a vector is a valu
 operation the widest registers that the CPU has, and splits it where they are narrower. ``+ - * /`` work
 between vectors, and between a vector and a number.
 
-Functions that take ``builder`` write LLVM code; the others are called from kernels.
+Functions that take ``builder`` write LLVM code: those ``_of_vectors`` are called from kernels without it, the
+others are their parts. All other functions are called from kernels, too.
 """
 
 from __future__ import annotations
@@ -147,7 +148,10 @@ def _of_vectors(result=None):
             def code(context, builder, sig, args):
                 return write(builder, *(_as_lanes(builder, *pair, width) for pair in zip(args, sig.args)))
 
-            return None if width is None else ((result or LanesType(width))(*kinds), code)
+            if width is None:
+                return None
+            given = LanesType(width) if result is None else result
+            return given(*kinds), code
 
         define.__name__, define.__doc__ = write.__name__, write.__doc__
         define.__signature__ = inspect.signature(write)  # by which Numba counts arguments

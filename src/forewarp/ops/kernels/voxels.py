@@ -291,7 +291,7 @@ def march(
     samples read, and of those above the threshold the number, the first step and the transmittance before it
     (last column of ``sums``). Else write the samples above the threshold from ``starts[r]`` on.
 
-    Where ``raw`` is None, nothing is read: each sample weighs 1 and hides nothing.
+    Where ``raw`` is None, nothing is read: samples hide nothing, and no ``weights`` are written.
     """
     counting = starts.shape[0] == 0
     for r in prange(origins.shape[0]):
@@ -318,7 +318,8 @@ def march(
                 if not counting:
                     ray_ids[starts[r] + found] = r
                     distances[starts[r] + found] = t
-                    weights[starts[r] + found] = weight
+                    if raw is not None:
+                        weights[starts[r] + found] = weight
                 elif found == 0:
                     firsts[r] = k
                     sums[r, 3] = through
