@@ -288,6 +288,12 @@ def test_the_released_faults_are_named():
     assert frozen.endswith("from 0.9 of the stage on (frozen_from)")
     mended = method("tineuvox", padded=False)
     assert (mended.faults(), mended.departures()[-1]) == ([], "grid sizes of 4 k + 1")
+    other = method("tineuvox", 16**3)
+    other.padded = False
+    with pytest.raises(
+        ValueError, match=r"model.padded: expected true for a grid of sizes \(.*\), but got false"
+    ):
+        other.read(some_points())
     assert method("ndvg").faults() == ["offsets jump at the canonical time (continuous)"]
     still = method("ndvg", still=some_points(5), continuous=True)
     assert still.faults() == ["points that never move are not looked at (weights.still)"]
