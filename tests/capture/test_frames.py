@@ -125,9 +125,12 @@ def with_sound(path, seconds):
         (lambda p: p.write_text("no video") and p, "a video, but got another file"),
         (lambda p: p.touch() or p, "a video, but got another file"),
         (lambda p: tone(p, 1), "a video, but got sound alone"),
-        (lambda p: write_film(p, numbered(2)), "a video of many frames, but got 2; film longer"),
+        (lambda p: write_film(p, numbered(2)), "a video of many frames, but got 2 frames; film longer"),
+        (lambda p: write_film(p, numbered(1)), "a video of many frames, but got one frame"),
         (lambda p: cut(noise(p, 9), 0.5), "a video, but got one that was cut off"),
         (lambda p: cut(noise(p, options=FAST), 0.5), "2.0 seconds, as its header says, but"),
+        # Two frames are left.
+        (lambda p: cut(noise(p, options=FAST), 0.055), "2.0 seconds, as .* but got 0.1; copy it again"),
         (lambda p: cut(with_sound(noise(p), 3), 0.5), "3.0 seconds, as its header"),
     ],
 )

@@ -518,8 +518,8 @@ def _refuse(video: Path, log: Log, count: int) -> None:
                 got = "one that was cut off; copy it again"
         got = "sound alone; choose a video" if "matches no streams" in text else got
         raise mismatch(video, "a video", got)
-    if count < _MIN_IMAGES:
-        raise mismatch(video, "a video of many frames", count, "film longer")
+    if count == 1:
+        raise mismatch(video, "a video of many frames", "one frame")
     if len(stamps) < count or not np.all(np.diff(stamps[:count]) > 0):
         expected = "a time stamp for each frame, each later than the one before"
         got = f"{len(stamps)} for {count} frames"
@@ -531,3 +531,5 @@ def _refuse(video: Path, log: Log, count: int) -> None:
         advice = "copy it again, or save the part that plays with a video editor"
         expected = f"{log.duration:.1f} seconds, as its header says"
         raise mismatch(video, expected, f"{seconds:.1f}", advice)
+    if count < _MIN_IMAGES:
+        raise mismatch(video, "a video of many frames", f"{count} frames", "film longer")
