@@ -70,10 +70,14 @@ def test_a_taken_port_and_a_run_that_is_not_finished_end_in_one_line(refused, fi
 def test_two_runs_of_different_scenes_are_refused():
     scene, views = ball_scene(frames=6), "got one with other test views"
     refuse_other_scene(scene, replace(scene, train=scene.train[:5]))
+    *first, last = scene.test  # the last is at time 1
+    close, later = ((*first, replace(last, time=last.time - change)) for change in (0.0005, 0.0015))
+    refuse_other_scene(scene, replace(scene, test=close))
     for changes, says in (
         ({"name": "cube"}, "expected a run of ball, as run= is, but got one of cube"),
         ({"test": scene.test[:2]}, views),
         ({"test": scene.test[::-1]}, views),
+        ({"test": later}, views),
     ):
         with pytest.raises(ValueError, match=says):
             refuse_other_scene(scene, replace(scene, **changes))

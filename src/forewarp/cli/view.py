@@ -87,9 +87,12 @@ def refuse_other_scene(scene, other) -> None:
 
     if scene.name != other.name:
         raise ValueError(f"run2: expected a run of {scene.name}, as run= is, but got one of {other.name}")
-    places = ([[frame.time, *frame.camera.center.tolist()] for frame in of.test] for of in (scene, other))
-    views, others = map(torch.tensor, places)
-    if views.shape != others.shape or not torch.allclose(views, others, rtol=TOLERANCE, atol=TOLERANCE):
+    same = len(scene.test) == len(other.test) and all(
+        abs(a.time - b.time) < TOLERANCE
+        and torch.allclose(a.camera.center, b.camera.center, rtol=TOLERANCE, atol=TOLERANCE)
+        for a, b in zip(scene.test, other.test)
+    )
+    if not same:
         expected = f"run2: expected a run of the same {scene.name} as run= is"
         raise ValueError(f"{expected}, but got one with other test views")
 
