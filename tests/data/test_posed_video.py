@@ -132,8 +132,14 @@ def test_points_of_a_ply_are_those_of_points_npy(tmp_path, kind):
 @pytest.mark.parametrize(
     ("text", "says"),
     [
-        ("solid\n", "a PLY whose first element is vertices of plain numbers"),
-        ("ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n0\n", "x, y, z too"),
+        ("solid\n", "whose first element is vertices, but got another file"),
+        (HEAD.format("binary", 1) + "0 0 0\n", r"a PLY \(ascii, .*\) whose first .*, but got another file"),
+        (HEAD.format("ascii", 1).replace("vertex", "face"), "is vertices, but got another file"),
+        (HEAD.format("ascii", 1).replace(PLACE, ""), "vertices of plain numbers .*, but got none"),
+        (
+            "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n0\n",
+            r"vertices of plain numbers .*, x, y, z too, but got \[\('x', 'f4'\)\]",
+        ),
         (HEAD.format("binary_little_endian", 9) + "short", "expected 9 vertices, but got a file that ends"),
         (HEAD.format("ascii", 2) + "0 0 0\n1 1\n", "expected 6 finite numbers, but got 5 values"),
         (HEAD.format("ascii", 1).replace("float z", "list uchar int z") + "0", "vertices of plain numbers"),

@@ -120,10 +120,13 @@ def _ply_places(path: Path) -> np.ndarray:
     properties = [line for line in vertices[1:] if line[:1] == ["property"] and len(line) > 2]
     columns = [(line[-1], _PLY_TYPES.get(line[1])) for line in properties]
     is_read = vertices[0][1:2] == ["vertex"] and vertices[0][-1].isdecimal() and order is not None
+    if not head.startswith(b"ply") or not is_read:
+        expected = f"a PLY ({', '.join(_PLY_ORDERS)}) whose first element is vertices"
+        raise mismatch(path, expected, "another file")
     are_numbers = None not in dict(columns).values() and len(dict(columns)) == len(columns)
-    if not head.startswith(b"ply") or not is_read or not {*"xyz"} <= dict(columns).keys() or not are_numbers:
-        expected = "a PLY whose first element is vertices of plain numbers with different names, x, y, z too"
-        raise mismatch(path, expected, f"{columns}" if columns else "another file")
+    if not {*"xyz"} <= dict(columns).keys() or not are_numbers:
+        expected = "vertices of plain numbers with different names, x, y, z too"
+        raise mismatch(path, expected, f"{columns or 'none'}")
     count = int(vertices[0][-1])
     if order == "=":
         words = body.split()[: count * len(columns)]
