@@ -5,6 +5,7 @@ import torch
 
 from forewarp.scene.camera import look_at
 from forewarp.scene.view import Moment, View
+from forewarp.viewer import rendering
 from forewarp.viewer.queue import Cancelled
 from forewarp.viewer.rendering import (
     SceneRenderer,
@@ -139,6 +140,19 @@ def test_a_layer_shows_its_particles_alone_and_voxels_have_none(viewer, state):
     seen.renderers[0].invalidate()  # as the method has changed
     rows.fill_(False)
     assert float(image_of(seen, replace(first, layer="moving", channel="opacity"), 24, 24).max()) == 0
+
+
+def test_layers_are_made_once_also_of_frames_that_cannot_be_hashed(monkeypatch):
+    data, made = small_data(), []
+    data.scene = replace(data.scene, train=[*data.scene.train])
+    monkeypatch.setattr(rendering, "layer_of", lambda *given, may_be_empty: made.append(given) or given[1])
+    renderer = SceneRenderer("particles", module_with(data), data)
+    for _ in range(2):
+        assert [renderer.method_of(layer) for layer in ("moving", "resting")] == ["moving", "resting"]
+    assert len(made) == 2
+    renderer.invalidate()
+    renderer.method_of("moving")
+    assert len(made) == 3
 
 
 def test_a_stale_image_ends_between_two_chunks(viewer, state):

@@ -6,7 +6,7 @@ import math
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache, partial
+from functools import lru_cache
 
 import torch
 from torch import Tensor
@@ -126,7 +126,7 @@ class SceneRenderer:
         self.renewal, self.tracks = renewal, tracks
         self._snapshots: list[tuple[str, Snapshot]] = []  # with their layers
         self._trajectories: tuple[float, Trajectories] | None = None
-        self._layer_of = lru_cache(len(LAYERS))(partial(layer_of, may_be_empty=True))
+        self._part = lru_cache(len(LAYERS))(self._part_of)
         self._canonical = lru_cache(_POINTS)(self.canonical_point)
         self._followed = lru_cache(_PATHS)(self._follow)
 
@@ -145,11 +145,14 @@ class SceneRenderer:
     def method_of(self, layer: str) -> Method:
         """Return the method, or the part of it that is a layer; there may be nothing in that."""
         method = self.module.method
-        return method if layer == LAYERS[0] else self._layer_of(method, layer, self.scene.train)
+        return method if layer == LAYERS[0] else self._part(method, layer)
+
+    def _part_of(self, method: Method, layer: str) -> Method:
+        return layer_of(method, layer, self.scene.train, may_be_empty=True)
 
     def invalidate(self) -> None:
         """Forget what was computed from the method's parameters, which have changed."""
-        self._layer_of.cache_clear()
+        self._part.cache_clear()
         self._snapshots.clear()
         self._canonical.cache_clear()
         self._followed.cache_clear()
