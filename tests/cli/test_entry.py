@@ -1,9 +1,11 @@
+import ast
 import errno
 import logging
 import os
 import platform
 import shutil
 from importlib.metadata import version
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -18,6 +20,7 @@ from forewarp.cli.mistakes import one_line, unknown_key, with_run_key
 from forewarp.data.files import SceneError
 from tests.support.configs import CONF, ROOT, options
 
+TEXTS = {path.stem: path.read_text() for path in sorted(Path(entry.__file__).parent.glob("*.py"))}
 COMMANDS = ("train", "evaluate", "render", "export", "synthesize", "report", "capture")
 
 
@@ -54,6 +57,12 @@ def test_info_prints_where_options_come_from(ok, monkeypatch):
     assert f"file://{CONF}" in ok("train", "--info", "searchpath").out
     assert "preset: fast" in ok("train", "--info=defaults-tree", "model=nerf").out
     assert "preset: demo" in ok("train", "model=nerf", "--info", "defaults-tree", "preset=demo").out
+
+
+@pytest.mark.parametrize("name", [name for name, text in TEXTS.items() if "\ndef main(" in text])
+def test_every_command_runs_as_a_module_too(name):
+    *_, last = ast.parse(TEXTS[name]).body
+    assert ast.unparse(last) == "if __name__ == '__main__':\n    main()"
 
 
 def test_the_version_is_forewarps(ok):

@@ -389,3 +389,7 @@ def main() -> None:
     except KeyboardInterrupt:
         print("\nforewarp-reproduce: interrupted; run the same command again to go on", file=sys.stderr)
         sys.exit(INTERRUPTED)
+
+
+if __name__ == "__main__":
+    main()
