@@ -8,9 +8,10 @@ import socket
 import sys
 import threading
 import urllib.request
+from collections import defaultdict
 from dataclasses import replace
 from types import SimpleNamespace
-from unittest.mock import Mock
+from unittest.mock import MagicMock, Mock
 
 import numpy as np
 import pytest
@@ -353,6 +354,35 @@ def test_why_there_is_no_screenshot_is_told(viewer, channel, error, says):
     page.tell = said.append
     page.save_screenshot()
     assert said == says
+
+
+def test_a_screenshot_that_cannot_be_sent_is_none_that_could_not_be_drawn(viewer):
+    page, image = object.__new__(Page), Mock(return_value=torch.ones(2, 2, 3))
+    page.viewer, page.tell, page.client = viewer, Mock(), Mock()
+    page.client.send_file_download.side_effect = RuntimeError("no connection")
+    page.session = SimpleNamespace(state=ViewState.first(viewer.scene), image=image)
+    with pytest.raises(RuntimeError, match="no connection"):
+        page.save_screenshot()
+    assert page.tell.call_count == 0
+
+
+@pytest.mark.parametrize(
+    ("broken", "says"), [("video", "no video: RuntimeError: no memory"), ("download", "written: {}")]
+)
+def test_a_video_that_cannot_be_sent_is_written_all_the_same(tmp_path, broken, says):
+    page, buttons, file = object.__new__(Page), defaultdict(Mock), tmp_path / "path-1.mp4"
+    file.touch()
+    page.client, page.session, page.folder = MagicMock(), Mock(), tmp_path
+    page.client.gui.add_button.side_effect = lambda label: buttons[label]
+    page.session.write_video.return_value = file
+    steps = {"video": page.session.write_video, "download": page.client.send_file_download}
+    steps[broken].side_effect = RuntimeError("no memory")
+    page._add_video()
+    make = buttons["make the video"]
+    with pytest.raises(RuntimeError) if broken == "download" else contextlib.nullcontext():
+        make.on_click.call_args.args[0](None)
+    assert page.client.gui.add_markdown.return_value.content == says.format(file)
+    assert make.disabled is False
 
 
 @pytest.mark.parametrize(

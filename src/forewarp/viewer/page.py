@@ -286,13 +286,16 @@ class Page:
             tell(f"{done} of {total} images")
 
         def make_video(_: viser.GuiEvent) -> None:
-            make.disabled = True
-            with told_if_it_fails("video", tell):  # also while an image is rendered
+            make.disabled, file = True, None
+            try:
                 length = float(seconds.value)
-                file = self.session.write_video(self.folder, list(keys), length, show_progress)
-                tell(f"written: {file}")
-                self.client.send_file_download(file.name, file.read_bytes(), save_immediately=True)
-            make.disabled = False
+                with told_if_it_fails("video", tell):  # also while an image is rendered
+                    file = self.session.write_video(self.folder, list(keys), length, show_progress)
+                if file is not None:
+                    tell(f"written: {file}")
+                    self.client.send_file_download(file.name, file.read_bytes(), save_immediately=True)
+            finally:
+                make.disabled = False
 
         on_press(add, lambda: set_keys(*keys, self.session.state))
         on_press(clear, set_keys)
@@ -300,7 +303,7 @@ class Page:
 
     def save_screenshot(self) -> None:
         """Send the image as a file, or say why there is none."""
-        state = self.session.state
+        state, image = self.session.state, None
         with told_if_it_fails("screenshot", self.tell):  # also by a browser that does not answer
             if state.drawn_by_browser:
                 width, height = self.canvas()
@@ -308,6 +311,7 @@ class Page:
                 image = torch.from_numpy(drawn[..., :3] / 255.0)
             else:
                 image = self.session.image(state, priority=1)
+        if image is not None:
             names = "-".join(renderer.name for renderer in self.viewer.renderers)
             name = f"{self.viewer.scene.name}-{names}-{state.channel}-{state.time:.3f}.png"
             self.client.send_file_download(name, png_bytes(image), save_immediately=True)
