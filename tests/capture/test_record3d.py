@@ -96,7 +96,9 @@ def test_frames_may_be_fewer_and_have_times_and_lenses_of_their_own(tmp_path):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"poses": []}, r"metadata: poses: expected some rows of 7 numbers, but got \[\]"),
+        ({"poses": []}, r"metadata: poses: expected a pose of each frame, but got \[\]"),
+        ({"poses": None}, "metadata: poses: expected a pose of each frame, but got None"),
+        ({"perFrameIntrinsicCoeffs": [[9.0] * 4]}, "perFrameIntrinsicCoeffs: expected 9 rows of 4 numbers"),
         ({"poses": [[0.0] * 7] * 9}, r"poses\[0\]: expected a quaternion of length 1, but got 0"),
         ({"poses": [[0.0] * 6] * 9}, r"metadata: poses\[0\]: expected 7 numbers, but got"),
         ({"K": [0.0] * 9}, "metadata: focal length of frame 0: expected above 0, but got 0"),

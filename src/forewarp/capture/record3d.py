@@ -171,8 +171,8 @@ class _Scan:
 
     def _rows(self, key: str, columns: int, count: int | None = None) -> list[list[float]]:
         rows = self.about.get(key)
-        if not isinstance(rows, list) or len(rows) != (count or max(1, len(rows))):
-            expected = f"{count or 'some'} rows of {columns} numbers"
+        if not isinstance(rows, list) or not rows or (count and len(rows) != count):
+            expected = f"{count} rows of {columns} numbers" if count else "a pose of each frame"
             raise mismatch(self.about.where(key), expected, short(rows))
         each = Entry(self.path, {f"[{i}]": row for i, row in enumerate(rows)}, f"metadata: {key}")
         return [each.numbers(place, columns, *_UNITS) for place in each.own]
