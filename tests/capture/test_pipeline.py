@@ -1,3 +1,5 @@
+from unittest.mock import Mock
+
 import pytest
 from filelock import FileLock
 
@@ -5,7 +7,7 @@ pytest.importorskip("pycolmap", reason="no pycolmap; make install adds it")
 
 from forewarp.capture import pipeline
 from forewarp.capture.frames import Frames, Source
-from forewarp.capture.pipeline import capture, work_folder
+from forewarp.capture.pipeline import capture, keep, work_folder
 from forewarp.capture.poses import Search, TooFewRegistered
 from tests.support.captures import step
 
@@ -62,6 +64,18 @@ def test_two_at_once_are_refused(tmp_path):
         with pytest.raises(ValueError, match="expected one capture at a time"):
             work(tmp_path / "hand")
         assert folder.is_dir()
+
+
+def test_what_was_kept_stays_until_the_new_is_whole(tmp_path):
+    best, full = tmp_path / "best", Mock(write=Mock(side_effect=OSError("full")))
+    best.mkdir()
+    (best / "images.bin").touch()  # of an older version, without a mark
+    with pytest.raises(OSError, match="full"):
+        keep(tmp_path, full, {"error": 1.0})
+    assert [path.name for path in best.iterdir()] == ["images.bin"]
+    for name in ("first.bin", "second.bin"):
+        keep(tmp_path, Mock(write=lambda folder, name=name: (folder / name).touch()), {"error": 1.0})
+        assert sorted(path.name for path in tmp_path.rglob("*")) == ["best", "error.json", name]
 
 
 def test_a_film_whose_poses_fail_is_tried_with_more_frames(tmp_path, monkeypatch):

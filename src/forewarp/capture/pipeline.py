@@ -112,10 +112,13 @@ def find_poses(work: Path, images: Frames, search: Search, step: Step, force: bo
 
 def keep(work: Path, model: pycolmap.Reconstruction, told: Mapping[str, object]) -> None:
     """Keep what was found in ``work / "best"``, whole."""
+    part = work / "part"
+    shutil.rmtree(part, ignore_errors=True)
+    part.mkdir()
+    model.write(part)
+    write_json(part / KEPT, dict(told))
     shutil.rmtree(work / BEST, ignore_errors=True)
-    with folder_written_whole(work / BEST, KEPT) as folder:
-        model.write(folder)
-        write_json(folder / KEPT, dict(told))
+    part.rename(work / BEST)
 
 
 def kept(work: Path) -> tuple[pycolmap.Reconstruction, dict] | None:
