@@ -1,9 +1,13 @@
 """Sections of files are options of Hydra's groups: ours, and those of a folder of one's own."""
 
+from unittest.mock import Mock
+
 import pytest
+from hydra.core.config_store import ConfigStore
 from hydra.core.object_type import ObjectType
 from hydra.errors import ConfigCompositionException
 
+from forewarp.runs import sections
 from forewarp.runs.sections import FileConfigSource, option_groups
 from tests.support.configs import CONF, composed
 
@@ -82,3 +86,14 @@ def test_options_are_listed_beside_files():
 def test_a_plain_value_is_that_of_the_groups_key():
     config = composed("model/rotation=none", "model/color_over_time=cosines")
     assert (config.model.rotation, config.model.color_over_time) == (None, 2)
+
+
+def test_a_sweep_is_stored_again_only_if_its_file_has_changed(tmp_path, monkeypatch):
+    store = Mock()
+    monkeypatch.setattr(ConfigStore, "instance", lambda: store)
+    monkeypatch.setattr(sections, "_stored", {})
+    for seed, count in ((1, 1), (1, 1), (2, 2), (1, 3)):
+        (tmp_path / "mine.yaml").write_text(f"seed: {seed}\n")
+        sections.serve(tmp_path)
+        assert store.store.call_count == count
+        assert store.store.call_args.args == ("mine", {"seed": seed}, "sweeps", "_global_")

@@ -32,14 +32,18 @@ OF_STAGES = ("stage", "objective")  # sections relative to their group, as Hydra
 OF_ALL = ("effects", "exceptions", "scenes")  # sections whose keys are those of the whole config
 
 
+_stored: dict[str, str] = {}  # what Hydra's store, which lasts as long as this process, has of each sweep
+
+
 def serve(sweeps: Path) -> None:
     """Have Hydra read folders with their sections, and a folder's files as ``sweeps``, in this process."""
     ours = {"file": FileConfigSource, "pkg": ImportlibResourcesConfigSource}
     SourcesRegistry.instance().types.update(ours)
     store = ConfigStore.instance()  # on Hydra's search path the folder above would be a config group
     for file in sorted(sweeps.glob("*.yaml")):
-        content = parsed(file.read_text("utf-8")).content
-        store.store(file.stem, content, "sweeps", "_global_", provider="forewarp")
+        if _stored.get(file.stem) != (text := file.read_text("utf-8")):
+            store.store(file.stem, parsed(text).content, "sweeps", "_global_", provider="forewarp")
+            _stored[file.stem] = text
 
 
 class _File(NamedTuple):
