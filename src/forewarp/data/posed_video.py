@@ -305,8 +305,18 @@ def _read_entries(
         taken_by = str(taken_by) if type(taken_by) in (str, int) else None  # an object is another program's
         moment = whole(entry.own["moment"], entry.where("moment"), 0) if "moment" in entry.own else None
         depth = entry.path("depth_file_path") if "depth_file_path" in entry.own else None
-        own = name, load, has_alpha and not opaque, beside, taken_by, moment, depth
-        entries.append(ImageEntry(*vars(image).values(), *own))
+        entries.append(
+            ImageEntry(
+                **vars(image),
+                name=name,
+                load=load,
+                is_cut_out=has_alpha and not opaque,
+                beside=beside,
+                taken_by=taken_by,
+                moment=moment,
+                depth=depth,
+            )
+        )
     for key, given in (
         ("mask_path", has_mask),
         ("moving_path", [e.beside["load_moving"] is not None for e in entries]),
