@@ -102,3 +102,10 @@ def test_the_fewest_changes_by_which_cameras_look_at_one_thing_are_named():
         assert other_readings(list(poses), CHANGES) == [said] * bool(said)
     assert other_readings(in_a_row(), CHANGES) == []
     assert other_readings(list(torch.linalg.inv(right)[:3]), CHANGES) == []
+
+
+def test_transposed_rotations_keep_their_scale_and_place():
+    poses = torch.arange(1.0, 33).reshape(2, 4, 4)
+    changed = transposed(poses)
+    torch.testing.assert_close(changed[:, :3, :3], poses[:, :3, :3].mT)
+    torch.testing.assert_close((changed[:, :3, 3], changed[:, 3]), (poses[:, :3, 3], poses[:, 3]))
