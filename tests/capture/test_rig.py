@@ -227,3 +227,16 @@ def test_a_camera_with_poses_of_few_frames_is_lost_and_named():
     found.cameras.pop("b/1")
     with pytest.raises(ValueError, match=r"with b \(and b\); leave it out \(without=\[a,b\]\)"):
         lost_of(taken, found, matches, True)  # one camera is no rig
+
+
+def test_who_says_what_moves_is_told_though_one_film_has_no_flow(tmp_path, monkeypatch):
+    work = SimpleNamespace(folder=tmp_path, masks=None, take=lambda *_: None)
+    (tmp_path / "masks").mkdir()
+    flows = iter([[np.ones((3, 4), bool)], None])
+    monkeypatch.setattr(rig, "moving_masks", lambda *_: next(flows))
+    films = [SimpleNamespace(name=name) for name in "ab"]
+    alike = {"is_fixed": False, "rows": [0], "times": [0.0], "moments": [0]}
+    taken = [SimpleNamespace(film=f, names=[f.name], looks=[f.name], **alike) for f in films]
+    found = SimpleNamespace(cameras={"a": "first", "b": "second"})
+    images, cameras = rig._frames_of(work, taken, found, "few", step)
+    assert (images.masks, images.masks_from, cameras) == (None, "optical flow", found.cameras)

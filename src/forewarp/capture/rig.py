@@ -630,7 +630,7 @@ def _frames_of(
             elif posed:
                 told.add("the masks given" if work.masks else "differences from what is mostly there")
     dark, by_camera = None if None in told else masks, {"cameras": taken_by, "moments": moments}
-    sources = " and ".join(sorted(map(str, told)))
+    sources = " and ".join(sorted(filter(None, told)))
     images = Frames(work.folder / "pictures", dark, times, why=why, masks_from=sources, **by_camera)
     return images, dict(sorted(cameras.items(), key=lambda pair: times[pair[0]]))
 
