@@ -30,7 +30,7 @@ install-browser: ## add a headless Chromium and playwright, which test the viewe
 		apt-get install -y -qq --no-install-recommends chromium fonts-dejavu-core >/dev/null; }
 	$(ADD) '.[browser]'
 
-demo: ## fit the procedural vehicle by three methods, two at once, compare, make a video and a page (about three minutes)
+demo: ## fit the procedural vehicle by three methods, two at once, compare, make a video and a page (about three minutes of two cores) [MINUTES=]
 	$(BIN)/forewarp-reproduce demo $(if $(MINUTES),minutes=$(MINUTES))
 demo-lego-complete: ## build a small counterpart of Lego Complete, fit a scene, evaluate, make a video
 demo-hypernerf: ## the same for a two-phone rig in a textured room, with a static background

@@ -108,6 +108,8 @@ def test_options_of_ones_own_stand_beside_ours(ok, in_tmp):
         (["logger=[tensorboard,wand]"], "; none; tensorboard; wandb; did you mean wandb?"),
         (["--inf"], "--inf: expected an option of Hydra's, but got none of this name; did you mean --info?"),
         (["--experiment", "demo"], "--experiment: expected options without dashes; type experiment=demo"),
+        (["experiment", "demo"], "or an existing folder, but got neither; type experiment=demo"),
+        (["model=nerf", "seeds", "--multirun"], "seeds: expected KEY=VALUE or an existing folder, but got"),
         (["modle/view_dependence=sh"], "modle/view_dependence: expected a key of the configuration, but got"),
         (["--multirun", "seed=0,1", "model=forward,backward", "budgt=fast"], "did you mean budget?"),
         (["data.scene=sc a,b"], "data.scene: expected one value, but got sc a,b, which reads as several; "),
@@ -167,7 +169,8 @@ def test_a_bare_folder_is_a_run(refused, in_tmp, name, key):
     (in_tmp / "demo").mkdir()
     line = "demo/config.yaml: expected the configuration of a run, but got none; set "
     assert refused(name, "demo").startswith(f"{line}{key}=")
-    assert "Error parsing override 'nothing'" in refused(name, "nothing")
+    line = "runs/nothing: expected KEY=VALUE or an existing folder, but got neither"
+    assert refused(name, "runs/nothing") == line
 
 
 def test_what_follows_an_option_is_no_run(in_tmp):

@@ -102,10 +102,12 @@ def test_columns_are_named_as_far_as_needed(runs, folders, methods, names):
 
 def test_what_is_no_run_is_refused(runs, in_tmp):
     runs(run={})
+    (in_tmp / "begun").mkdir()
     (in_tmp / "run" / "metrics.json").write_text(json.dumps({"protocol": {}, "test": {}}))
     for folders, line in (
         (["run"], "run: expected a measured run, but got no key 'seconds'; measure it"),
-        (["none"], "none/metrics.json: expected a run's numbers, but got none; make them"),
+        (["none"], "runs: expected folders of runs, but got none, which is not there"),
+        (["begun"], "begun/metrics.json: expected a run's numbers, but got none; make them"),
         ([], "runs: expected folders of runs, but got none; set runs="),
     ):
         with pytest.raises(ValueError, match=f"^{line}"):

@@ -40,7 +40,8 @@ def with_run_key(name: str, arguments: list[str]) -> list[str]:
 
 
 def refuse_dashes(arguments: list[str]) -> None:
-    """Refuse what is typed as other programs have it, ``--experiment dnerf``; Hydra's own options pass.
+    """Refuse what is typed as other programs have it, ``--experiment dnerf`` or ``experiment dnerf``; Hydra's
+    own options pass.
 
     Raises:
         ValueError: with the way to type it.
@@ -54,6 +55,11 @@ def refuse_dashes(arguments: list[str]) -> None:
             if not value and (near := difflib.get_close_matches(key, OPTIONS, 1, cutoff=0.75)):
                 says = f"expected an option of Hydra's, but got none of this name; did you mean --{near[0]}?"
             raise ValueError(f"{argument}: {says}")
+        if re.fullmatch(r"[\w.@/]+", argument) and (at == 0 or arguments[at - 1][:1] != "-"):
+            follows = arguments[at + 1] if at + 1 < len(arguments) else "VALUE"
+            value = "VALUE" if "=" in follows or follows[:1] == "-" else follows
+            advice = "" if "/" in argument else f"; type {argument}={value}"
+            raise ValueError(f"{argument}: expected KEY=VALUE or an existing folder, but got neither{advice}")
 
 
 def options_last(arguments: list[str]) -> list[str]:

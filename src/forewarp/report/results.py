@@ -346,6 +346,8 @@ def read_compared(folders: Sequence[str | Path]) -> dict[str, Row]:
         raise ValueError("runs: expected folders of runs, but got none; set runs=[FOLDER,FOLDER]")
     rows, paths = [], [Path(folder) for folder in folders]
     for path in paths:
+        if not path.is_dir():
+            raise ValueError(f"runs: expected folders of runs, but got {path}, which is not there")
         again, numbers = f"forewarp-evaluate run={path}", path / "metrics.json"
         if not numbers.is_file():
             raise ValueError(f"{numbers}: expected a run's numbers, but got none; make them with {again}")
