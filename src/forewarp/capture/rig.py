@@ -19,8 +19,21 @@ from urllib.parse import quote
 import numpy as np
 import pycolmap
 
-from forewarp.capture import frames, poses, scene
-from forewarp.capture.frames import NO_MASKS, TAKEN, Frames, Progress, Step
+from forewarp.capture import poses, scene
+from forewarp.capture.frames import (
+    MOST,
+    NO_MASKS,
+    SHORT,
+    TAKEN,
+    Frames,
+    Progress,
+    Step,
+    images_in,
+    read_mask,
+    within,
+    write_mask,
+    write_masks,
+)
 from forewarp.capture.motion import Still, is_fixed, moving_masks, resized_mask
 from forewarp.capture.pipeline import ABOUT, PICTURE, keep, kept, record, work_for
 from forewarp.capture.poses import Reconstruction, Search
@@ -87,7 +100,7 @@ class Recording:
                 if (got := by(pixels.shape[1::-1])) != first:
                     expected = f"{first} pixels as {self.images[0].name}"
                     raise mismatch(self.images[row], expected, got, _without(self.name))
-                yield frames.within(pixels, size)
+                yield within(pixels, size)
             return
         films, count = [extracted(self.path, list(rows), size, threads)], 0
         if len(rows) * _SEEK < rows[-1]:
@@ -114,7 +127,7 @@ def cameras_in(folder: Path) -> dict[str, Path]:
     found = {path.stem: path for path in paths}
     if not found:
         inner = ((path, place) for path in there if path.is_dir() for place in (path, path / "images"))
-        found = {path.name: place for path, place in inner if place.is_dir() and frames.images_in(place)}
+        found = {path.name: place for path, place in inner if place.is_dir() and images_in(place)}
     if len(found) < 2:
         got = f"one, {next(iter(found))}; for one camera set video=" if found else "none"
         raise mismatch("videos", f"at least two videos, or sub-folders of pictures, in {folder}", got)
@@ -143,7 +156,7 @@ def recordings(folder: Path, rate: float | None, without: Sequence[str] = ()) ->
 def _recording(name: str, path: Path, rate: float | None) -> Recording:
     images = ()
     if path.is_dir():
-        images = tuple(frames.images_in(path))
+        images = tuple(images_in(path))
         numbers = numbers_in([image.stem for image in images]) or range(len(images))
         stamps = np.array(numbers, dtype=np.float64) / (rate or 1.0)
         order = np.argsort(stamps, kind="stable")
@@ -309,8 +322,8 @@ def choose(
     begin, end = span[0] - 1e-6 * gap, span[1] + 1e-6 * gap
     inside = [np.flatnonzero((clock >= begin) & (clock <= end)) for clock in clocks]
     most = max(map(len, inside))
-    limit = min(frames.MOST, max(2, _MOST_IMAGES // len(films)))
-    if count is None and most <= min(frames.SHORT, limit):
+    limit = min(MOST, max(2, _MOST_IMAGES // len(films)))
+    if count is None and most <= min(SHORT, limit):
         runs = [clock[0] <= begin + 2e-6 * gap and clock[-1] >= end - 2e-6 * gap for clock in clocks]
         fullest = max(range(len(films)), key=lambda film: (runs[film], len(inside[film])))
         rows, grid, why = inside, clocks[fullest], "every frame of short films"
@@ -456,8 +469,8 @@ class _Work:
             got = f"none called {film.name} in {self.masks}"
             raise mismatch("masks", "a sub-folder for each camera", got)
         originals = {film.frame(row): film.images[row].name for row in rows} if film.images else {}
-        frames.write_masks(self.folder / to, mine, sizes, rows, len(film.stamps), originals)
-        return [frames.read_mask(self.folder / to / f"{name}.png") for name in sizes]
+        write_masks(self.folder / to, mine, sizes, rows, len(film.stamps), originals)
+        return [read_mask(self.folder / to / f"{name}.png") for name in sizes]
 
     def take(self, mine: Taken, still: Still | None = None, tick: Progress = lambda *_: None) -> None:
         """Write the frames of a camera and what moves in them, unless an earlier call has done so."""
@@ -468,7 +481,7 @@ class _Work:
         for done, (name, pixels) in enumerate(zip(mine.names, pixels_of), 1):
             write_image(self.folder / "pictures" / name, pixels)
             if still is not None:
-                frames.write_mask(self.folder / "masks" / f"{name}.png", still.moves(pixels))
+                write_mask(self.folder / "masks" / f"{name}.png", still.moves(pixels))
             tick(done, len(mine.rows))
         if self.masks is not None:
             self.given(mine.film, mine.rows, pixels.shape[1::-1], "masks")
@@ -504,8 +517,8 @@ def _look_at(work: _Work, mine: Taken, fixed: bool | None) -> dict:
             (looks / name).parent.mkdir(parents=True, exist_ok=True)
             shutil.copy(work.folder / "pictures" / frame, looks / name)
             given = work.folder / "masks" / f"{frame}.png"
-            moves = frames.read_mask(given) if work.masks else np.zeros(size[::-1], bool)
-            frames.write_mask(dark / f"{name}.png", moves)
+            moves = read_mask(given) if work.masks else np.zeros(size[::-1], bool)
+            write_mask(dark / f"{name}.png", moves)
         return {"fixed": False, "names": names}
     name = f"{place}/still_{few[0]}_{few[-1]}_{len(few)}.png"
     still = Still.of(images)
@@ -514,7 +527,7 @@ def _look_at(work: _Work, mine: Taken, fixed: bool | None) -> dict:
     moves = resized_mask(polluted, size)
     if work.masks is not None:
         moves |= np.mean(work.given(film, few, size, "given"), axis=0) >= _POLLUTED
-    frames.write_mask(dark / f"{name}.png", moves)
+    write_mask(dark / f"{name}.png", moves)
     np.savez(looks / f"{film.name}.npz", image=still.image, least=still.least)
     return {"fixed": True, "names": [name]}
 
@@ -626,7 +639,7 @@ def _frames_of(
                 of_film = moving_masks(paths, list(posed.values()))
                 told.add("optical flow" if of_film else None)
                 for name, mask in zip(posed, of_film or ()):
-                    frames.write_mask(masks / f"{name}.png", mask)
+                    write_mask(masks / f"{name}.png", mask)
             elif posed:
                 told.add("the masks given" if work.masks else "differences from what is mostly there")
     dark, by_camera = None if None in told else masks, {"cameras": taken_by, "moments": moments}
