@@ -18,8 +18,6 @@ WHEEL_RADIUS, WHEEL_SIDE = 0.16, 0.285
 PIVOT, BOOM, STICK = (0.10, 0.0, 0.44), 0.62, 0.46
 BALL_RADIUS, BALL_AT = 0.17, (0.34, -0.48)
 BAND_FROM, BAND_ALONG_STICK, BAND_SIDE, BAND_RADIUS = (-0.05, 0.52), 0.36, 0.125, 0.022
-Triple = tuple[float, float, float]
-ARM, BALL = (40.0, -132.0, 14.0), (0.0, 0.0, 1.0)  # at rest; see ``placed``
 START, DRIVE_START = (-0.22, 0.08, 18.0), (-0.32, -0.02, 4.0)  # x, y and heading in degrees
 
 YELLOW, AMBER, CHARCOAL = (0.96, 0.76, 0.20), (0.80, 0.58, 0.12), (0.25, 0.26, 0.29)
@@ -44,21 +42,22 @@ def ease(time: float) -> float:
 
 def lift(time: float) -> dict[str, np.ndarray]:
     """Lift the boom; return each joint's map."""
-    return placed(START, (39 + 42 * ease(time), -112, ARM[2]))
+    return placed(START, boom=39 + 42 * ease(time), stick=-112)
 
 
 def lift_tilt(time: float) -> dict[str, np.ndarray]:
     """Lift and tilt the whole arm while the ball bounces and drifts; return each joint's map."""
     up, contact = ease(time), 0.5 - 0.5 * np.cos(2 * np.pi * time)
-    arm = 46 + 14 * up, -116 + 26 * up, 10 + 16 * up + 8 * np.sin(np.pi * time) ** 2
-    return placed(START, arm, ball=(0.3 * (1 - contact), 0.12 * up, 1.06 - 0.3 * contact))
+    arm = {"boom": 46 + 14 * up, "stick": -116 + 26 * up}
+    arm["bucket"] = 10 + 16 * up + 8 * np.sin(np.pi * time) ** 2
+    return placed(START, **arm, height=0.3 * (1 - contact), drift=0.12 * up, squash=1.06 - 0.3 * contact)
 
 
 def drive(time: float) -> dict[str, np.ndarray]:
     """Drive along an arc while the arm moves; return each joint's map."""
     go = ease(time)
-    arm = 40 + 14 * go, -132 + 30 * go, 14 + 20 * go
-    return placed(DRIVE_START, arm, travel=0.42 * go, turn=32 * go)
+    arm = {"boom": 40 + 14 * go, "stick": -132 + 30 * go, "bucket": 14 + 20 * go}
+    return placed(DRIVE_START, **arm, travel=0.42 * go, turn=32 * go)
 
 
 def still(time: float) -> dict[str, np.ndarray]:
@@ -80,17 +79,26 @@ MOTIONS = {"lift": lift, "lift_tilt": lift_tilt, "drive": drive}
 
 
 def placed(
-    start: Triple, arm: Triple = ARM, *, travel: float = 0.0, turn: float = 0.0, ball: Triple = BALL
+    start: tuple[float, float, float],
+    *,
+    boom: float = 40.0,
+    stick: float = -132.0,
+    bucket: float = 14.0,
+    travel: float = 0.0,
+    turn: float = 0.0,
+    height: float = 0.0,
+    drift: float = 0.0,
+    squash: float = 1.0,
 ) -> dict[str, np.ndarray]:
     """Compute each joint's affine map (4, 4) from its rest frame to the world.
 
     Args:
         start: the chassis's x, y and heading in degrees.
-        arm: boom, stick and bucket in degrees, each relative to the link before it.
+        boom, stick, bucket: degrees, each relative to the link before it.
         travel, turn: of the chassis, world units and degrees.
-        ball: its height above the ground and its drift, world units, and its own height over its diameter.
+        height, drift: of the ball, world units.
+        squash: the ball's height over its diameter.
     """
-    (boom, stick, bucket), (height, drift, squash) = arm, ball
     chassis = link = _along_arc(start, travel, turn)
     maps = {"ground": shift((0, 0, GROUND)), "chassis": chassis, "band": chassis @ _band(boom, boom + stick)}
     joints = (("boom", PIVOT, boom), ("stick", (BOOM, 0, 0), stick), ("bucket", (STICK, 0, 0), bucket))
@@ -130,7 +138,7 @@ def _band(boom: float, stick: float) -> np.ndarray:
     return place
 
 
-def _along_arc(start: Triple, travel: float, turn: float) -> np.ndarray:
+def _along_arc(start: tuple[float, float, float], travel: float, turn: float) -> np.ndarray:
     """Move the chassis by ``travel`` along a circular arc that turns it by ``turn`` degrees."""
     x, y, heading = start
     half = np.radians(turn / 2)
