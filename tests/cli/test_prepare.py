@@ -5,7 +5,7 @@ import re
 import pytest
 from omegaconf import OmegaConf
 
-from forewarp.cli.prepare import MARKERS, refuse_missing_scene, refuse_numbers
+from forewarp.cli.prepare import READ, refuse_missing_scene, refuse_numbers
 from forewarp.data import module as data_module
 from forewarp.data.files import LAYOUTS, SceneError
 
@@ -51,15 +51,14 @@ def test_a_mistyped_scene_is_put_right(tmp_path):
         refuse_missing_scene(OmegaConf.create({"data": data, "absent": "skip"}))
 
 
-@pytest.mark.parametrize("name", MARKERS)
+@pytest.mark.parametrize("name", READ)
 def test_a_scene_is_told_by_the_file_that_its_reader_asks_for(name, tmp_path):
-    marker = MARKERS[name]
+    marker, _ = LAYOUTS[READ[name]]
     datamodule = getattr(data_module, name)(tmp_path, "toy")
     with pytest.raises(SceneError, match=re.escape(f"toy: expected a scene with {marker}, but got none")):
         datamodule.setup("fit")
-    assert marker in {of_layout for of_layout, _ in LAYOUTS.values()}
 
 
-def test_every_module_that_reads_a_folder_has_a_marker():
+def test_every_module_that_reads_a_folder_has_a_layout():
     modules = (each for each in vars(data_module).values() if hasattr(each, "_reader"))
-    assert {each.__name__ for each in modules} == {*MARKERS}
+    assert {each.__name__ for each in modules} == {*READ}

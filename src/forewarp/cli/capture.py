@@ -40,7 +40,7 @@ import importlib.util
 from pathlib import Path
 
 from forewarp.cli.entry import command
-from forewarp.data.files import one_of, whole
+from forewarp.data.files import LAYOUTS, one_of, whole
 from forewarp.files import check_replaceable
 from forewarp.runs.config import check_seed
 from forewarp.runs.overrides import command_line, text_override
@@ -138,7 +138,7 @@ def check(config) -> tuple[dict, object]:
         if inside or (ours and ours.is_relative_to(place)):
             expected = f"out: expected a folder apart from what is read, but got {out}"
             raise ValueError(f"{expected} with {key}={path}; set out=...")
-    if (out / "transforms.json").exists() and not config.overwrite:
+    if (out / LAYOUTS["nerfstudio"][0]).exists() and not config.overwrite:
         raise ValueError(f"{out}: expected a new folder, but got a scene; set overwrite=true or out=...")
     check_replaceable(out, "capture.json")
     return source, out

@@ -25,15 +25,15 @@ if TYPE_CHECKING:  # loads torch
     from forewarp.runs.fitted import Score
     from forewarp.training.stages import Run
 
-# The file that every scene of our data modules has; those of others, and those that make their scene, check
-# for themselves.
-MARKERS = {
-    "DNeRFDataModule": "transforms_train.json",
-    "LegoCompleteDataModule": "transforms_train.json",
-    "HyperNeRFDataModule": "dataset.json",
-    "NHRDataModule": "CamPose.inf",
-    "MulticamDataModule": "poses_bounds.npy",
-    "PosedVideoDataModule": "transforms.json",
+# The layouts that our data modules read; those of others, and those that make their scene, check for
+# themselves.
+READ = {
+    "DNeRFDataModule": "D-NeRF",
+    "LegoCompleteDataModule": "D-NeRF",
+    "HyperNeRFDataModule": "HyperNeRF",
+    "NHRDataModule": "NHR",
+    "MulticamDataModule": "DyNeRF",
+    "PosedVideoDataModule": "nerfstudio",
 }
 VOXELS, PARTICLES = "forewarp.methods.voxel.", "forewarp.methods.particles."
 
@@ -157,9 +157,9 @@ def refuse_missing_scene(config: DictConfig) -> None:
     Raises:
         SceneError: listing the scenes that are there.
     """
-    marker = MARKERS.get(str(config.data.get("_target_")).removeprefix("forewarp.data.module."))
-    if marker is not None and config.get("absent", "refuse") == "refuse":
-        scene_folder(Path(config.data.root).expanduser(), str(config.data.scene), marker)
+    layout = READ.get(str(config.data.get("_target_")).removeprefix("forewarp.data.module."))
+    if layout is not None and config.get("absent", "refuse") == "refuse":
+        scene_folder(Path(config.data.root).expanduser(), str(config.data.scene), layout)
 
 
 def refuse_missing_start(config: DictConfig) -> None:

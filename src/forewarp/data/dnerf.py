@@ -119,7 +119,7 @@ def read_scene(
     near, far = number_or_none(near, "data.near"), number_or_none(far, "data.far")
     one_of(angle, "data.angle", "width", "longer")
     one_of(half_resolution, "data.half_resolution", True, False, "auto")
-    folder = scene_folder(root, scene, "transforms_train.json")
+    folder = scene_folder(root, scene, "D-NeRF")
     every = whole(test_every, "data.test_every", 2)
     records, assumed = _read_records(folder, axes, inverse, angle == "longer", every)
     everything = [record for split in records.values() for record in split]

@@ -237,13 +237,13 @@ def frames_of(file: Path, content: dict) -> list[Entry]:
     return [Entry(file, stated(frame), f"frames[{i}].", common) for i, frame in enumerate(frames)]
 
 
-def scene_folder(root: str | Path, scene: str, marker: str) -> Path:
-    """Find the folder ``root/scene``, which must hold ``marker``, a file that every scene of a format has.
+def scene_folder(root: str | Path, scene: str, layout: str) -> Path:
+    """Find the folder ``root/scene``, which must hold the file that every scene of a ``layout`` has.
 
     Raises:
         SceneError: where there is none, naming the scenes that there are.
     """
-    root = Path(root)
+    root, (marker, _) = Path(root), LAYOUTS[layout]
     if not root.is_dir():
         raise mismatch("data.root", "an existing folder", root, "set data.root")
     folder = root / scene

@@ -107,7 +107,7 @@ def read_scene(
     Raises:
         SceneError: for every file or value that is missing or wrong, with file and key.
     """
-    folder = scene_folder(root, scene, "dataset.json")
+    folder = scene_folder(root, scene, "HyperNeRF")
     images = folder / "rgb" / f"{whole(scale, 'data.scale', 1)}x"
     if not images.is_dir():
         there = ", ".join(in_order(p.name for p in folder.glob("rgb/*x") if p.is_dir())) or "none"

@@ -96,7 +96,7 @@ def read_scene(
 
     Cost: a pass over each video that decodes its first frame alone; a small read of each image.
     """
-    folder = scene_folder(root, scene, FILE)
+    folder = scene_folder(root, scene, "DyNeRF")
     one_of(normalise, "data.normalise", True, False)
     scale, every = whole(scale, "data.scale", 1), whole(test_every, "data.test_every", 1)
     paths = _paths(folder)

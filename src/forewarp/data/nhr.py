@@ -76,7 +76,7 @@ def read_scene(
 
     Cost: two small reads an image and one of every point.
     """
-    folder = scene_folder(root, scene, "CamPose.inf")
+    folder = scene_folder(root, scene, "NHR")
     one_of(half_resolution, "data.half_resolution", True, False)
     poses, matrices = _read_poses(folder / "CamPose.inf"), _read_intrinsics(folder / "Intrinsic.inf")
     if len(poses) != len(matrices):

@@ -29,7 +29,17 @@ from forewarp.data.arrays import read_cloud, write_array
 from forewarp.data.cameras import MOST_UNITS, SPLITS, box_of, number_or_none, opengl_rows, space_of
 from forewarp.data.depth import LEVELS, MILLIMETRES, SensedDepth, confidence_of, depths_beside, depths_named
 from forewarp.data.directions import check_directions
-from forewarp.data.files import inside, mismatch, one_of, read_json, remove, scene_folder, stated, whole
+from forewarp.data.files import (
+    inside,
+    mismatch,
+    number,
+    one_of,
+    read_json,
+    remove,
+    scene_folder,
+    stated,
+    whole,
+)
 from forewarp.data.images import (
     SUFFIXES,
     MovingMask,
@@ -139,7 +149,7 @@ def read_scene(
     whole(test_every, "data.test_every", 2)
     one_of(normalise, "data.normalise", True, False)
     one_of(depth_kind, "data.depth_kind", "metric", "relative", "inverse")
-    file = scene_folder(root, scene, FILE) / FILE
+    file = scene_folder(root, scene, "nerfstudio") / FILE
     content = stated(read_json(file))
     entries, absent, assumed = _read_entries(file, content, scale, axes, inverse, masks)
     if (file.parent / "masks").is_dir() and not any("mask_path" in f for f in content["frames"]):
@@ -198,7 +208,7 @@ def read_scene(
         unit = 1.0
         if depth_kind == "metric":
             unit = (MILLIMETRES if path.suffix == ".png" else 1.0) if depth_scale is None else depth_scale
-            unit = number_or_none(unit, "data.depth_scale", 1 / MOST_UNITS) * space.scale
+            unit = number(unit, "data.depth_scale", 1 / MOST_UNITS, MOST_UNITS) * space.scale
         top = place or file.parent / path.relative_to(file.parent).parts[0]
         return SensedDepth(path, camera, unit, confidence_of(path, top), depth_kind, still)
 
@@ -415,7 +425,7 @@ def _bounds(file: Path, content: dict, box: Sequence[float] | None) -> Box | Non
     if box is not None or corners is None:
         return box_of(box)
     try:
-        return Box(*(tuple(number_or_none(v, "aabb", -MOST_UNITS) for v in corner) for corner in corners))
+        return Box(*(tuple(number(v, "aabb", -MOST_UNITS, MOST_UNITS) for v in corner) for corner in corners))
     except (TypeError, ValueError) as error:
         expected = "[[x0, y0, z0], [x1, y1, z1]], each low end below its high end"
         raise mismatch(f"{file}: aabb", expected, short(corners)) from error
