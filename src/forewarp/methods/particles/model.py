@@ -16,6 +16,7 @@ from forewarp.fields.moving import GaussiansSnapshot, MovingGaussians, NodeMotio
 from forewarp.losses import IMAGE_LOSSES, robust
 from forewarp.methods.method import Method, Snapshot, Start, Step, value_at
 from forewarp.methods.particles import density, exposure
+from forewarp.methods.particles.contact import set_down
 from forewarp.methods.particles.nodes import Nodes, Skinning, TimeOffsets, are_rows
 from forewarp.methods.particles.options import EFFECTS, SMALLEST, Effects, Numbers, view_share
 from forewarp.methods.particles.shared import begin_window, check_still, left_alone
@@ -101,8 +102,8 @@ class Particles(Method):
         self.small_by, self.small = 1.0, {}  # images made so many times smaller, by frame
 
         self.box = start.scene.box if self.stage.shell and not start.scene.has_alpha else None
-        values = self._first_values(start)
-        count = len(values["means"])
+        values = self._first_values(start, effects.motion is not None and self.stage.rest_by_masks)
+        new, count = values.pop("set_down", None), len(values["means"])
         self.means = nn.Parameter(values["means"])
         self.scales = nn.Parameter(values["scales"])  # logarithms
         self.quaternions = nn.Parameter(values["quaternions"])  # w, x, y, z of any length
@@ -127,6 +128,8 @@ class Particles(Method):
         resting = self.beyond(self.means.data) if may_rest else None
         if may_rest and self.stage.rest_by_masks and not start.blank:
             resting |= at_rest(start.scene, self.means.data)
+            if new is not None:
+                resting &= ~new
         self.register_buffer("resting", resting)
         # Rows of the run that windows of a film begin from: particles that stay as they are; -1: of its own.
         self.register_buffer("shared", values.get("shared"))
@@ -150,12 +153,16 @@ class Particles(Method):
         self.grows = tuple(name for name in _ROWS if getattr(self, name) is not None)
         self.grows += () if self.skinning is None else Skinning.ROWS
 
-    def _first_values(self, start: Start) -> dict[str, Tensor]:
+    def _first_values(self, start: Start, sets_down: bool) -> dict[str, Tensor]:
         """Return the first value of every parameter: fresh, or of the stage before.
 
         Also register ``covered_pixels``: mean number of pixels of an image that show anything; ``extent``:
         median distance of points from the middle; and ``final_count``: how many particles there will be,
         beside those that are ``shared``, then of the ``moving_pixels``.
+
+        Args:
+            start: what it is built from.
+            sets_down: what moves in a film; see ``contact.set_down``.
 
         Raises:
             ValueError: if the run that a window begins from is not one of particles that stand still.
@@ -172,6 +179,8 @@ class Particles(Method):
                 values = {n: p.data.to("cpu", copy=True) for n, p in before.named_parameters(recurse=False)}
                 if before.shared is not None:
                     values["shared"], moving = before.shared.to("cpu", copy=True), float(before.moving_pixels)
+                if sets_down and not start.blank:
+                    values = set_down(values, before, start.scene)
         elif start.blank:
             covered = extent = 1.0
             values = first_values(Cloud(torch.zeros(1, 3), torch.zeros(1, 3), torch.zeros(1), 1.0))

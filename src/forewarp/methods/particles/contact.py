@@ -1,0 +1,140 @@
+"""Where what moves begins in a film of one camera: standing on what rests.
+
+One camera cannot tell how far away a thing is that moves by itself: neighbouring images agree on a depth that
+its own motion feigns, and later images do not correct it. But things stand, lie or roll on a ground, whose
+depth is known from many images: that of the ground right below the lower edge of a thing is about its own.
+What flies is set on what lies below it in the image, and what something hides below on that.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from forewarp.ops.gaussians import FLAT
+from forewarp.ops.grid import dilate
+from forewarp.scene.frame import Frame, Scene, where_seen
+from forewarp.scene.view import Moment, View
+
+if TYPE_CHECKING:
+    from forewarp.methods.particles.model import Particles
+
+_SMALLEST = 1e-3  # share of an image's pixels, below which a patch of a mask is no thing
+# Share of a thing's height, above its lowest row, within which columns end that touch the ground.
+_LOWEST = 0.2
+# Shares of an image's height: by which a look goes below a thing's lower edge; by which its mask is enlarged,
+# as what stood in for it is blurred; and between new particles, whose deviation is ``_ROUND`` of that.
+_BELOW, _EDGE, _STEP, _ROUND = 8e-3, 6e-3, 4e-3, 0.7
+# Shares of the ground's distance, from which on particles lie behind a thing, and beside it.
+_BEHIND, _BESIDE = 1.05, 0.95
+_OPACITY = 2.0  # logit, of a new particle
+_SEEN = 0.5  # opacity from which on the ground is known
+
+
+@torch.no_grad()
+def set_down(values: dict[str, Tensor], before: Particles, scene: Scene) -> dict[str, Tensor]:
+    """Put what the canonical image's mask says moves at the distance of the ground that it stands on.
+
+    What has no ground in sight, as it (nearly) reaches the lower edge of the image, stays as it is.
+
+    Args:
+        values: of the N first particles, by name.
+        before: fitted at rest; it shows the ground.
+        scene: of one camera, with masks of what moves and no measured depth; else nothing changes.
+
+    Returns:
+        the values, without particles that stood in for these things, and with new ones last; ``set_down``,
+        bool of each, says which are new. Where nothing changes, the values as they are.
+
+    Cost: an image is rendered.
+    """
+    frame = min(scene.train, key=lambda frame: abs(frame.time - scene.canonical_time))
+    if before.moves or frame.load_moving is None or frame.load_sensed is not None or not scene.has_one_camera:
+        return values
+    camera, height = frame.camera, frame.camera.height
+    moment = Moment(frame.time, camera=frame.camera_id, filmed=True)
+    drawn = before.at(moment).render(View(camera), torch.zeros(3)).shaped(height, camera.width)
+    means, center = values["means"], camera.center.float()
+    row, column, visible = where_seen(camera, means)
+    row, column = row.clamp(0, height - 1), column.clamp(0, camera.width - 1)
+    away, gone = (means - center).norm(dim=-1), torch.zeros(len(means), dtype=torch.bool)
+    light, parts = before.light(moment), []
+    light = None if light is None else light.cpu()
+    depth = torch.where(drawn.opacity > _SEEN, drawn.depth, 0.0)
+    for thing, distance in things_on_the_ground(frame, depth):
+        part = _billboard(frame, thing, distance, light)
+        if len(part["means"]):
+            parts.append(part)
+            beside = dilate(thing, max(1, round(_EDGE * height))) & ~frame.load_moving()
+            gone |= visible & thing[row, column] & (away < _BEHIND * distance)
+            gone |= visible & beside[row, column] & (away < _BESIDE * distance)
+    if not parts:
+        return values
+    if "shared" in values:
+        gone &= values["shared"] < 0
+    fresh = {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
+    count, kept = len(fresh["means"]), {}
+    for name, value in values.items():
+        if name == "exposure":
+            kept[name] = value
+        else:
+            empty = value.new_full((count, *value.shape[1:]), -1 if name == "shared" else 0)
+            kept[name] = torch.cat([value[~gone], fresh.get(name, empty)])
+    kept["set_down"] = torch.arange(len(kept["means"])) >= len(kept["means"]) - count
+    return kept
+
+
+def things_on_the_ground(frame: Frame, depth: Tensor) -> list[tuple[Tensor, float]]:
+    """Tell the things that move in an image apart, and how far away the ground is that each stands on.
+
+    Args:
+        frame: with a mask of what moves.
+        depth: (H, W) distances along rays to what rests, world units, 0 where not known.
+
+    Returns:
+        masks (H, W) bool, and distances; nothing of what reaches the lower edge of the image, or stands
+        mostly on what is not known.
+    """
+    from scipy.ndimage import label  # late, as its import takes time
+
+    moving, height = frame.load_moving(), len(depth)
+    if frame.load_valid is not None:
+        depth = torch.where(frame.load_valid(), depth, 0.0)
+    labels, found = torch.from_numpy(label(moving.numpy(), torch.ones(3, 3))[0]), []
+    counts, below = labels.flatten().bincount(), max(1, round(_BELOW * height))
+    for number in (counts >= _SMALLEST * labels.numel()).nonzero()[:, 0].tolist():
+        thing = labels == number
+        rows = thing.any(1).nonzero()[:, 0]
+        top, bottom = int(rows[0]), int(rows[-1])
+        if number == 0 or bottom + below >= height:
+            continue
+        lowest = torch.where(thing, torch.arange(height)[:, None], -1).amax(0)  # of each column
+        columns = (lowest >= bottom - _LOWEST * (bottom - top)).nonzero()[:, 0]
+        at = lowest[columns] + below
+        ground = torch.where(moving[at, columns], 0.0, depth[at, columns])
+        known = ground[ground > 0]
+        if 2 * len(known) >= len(ground):
+            found.append((thing, float(known.median())))
+    return found
+
+
+def _billboard(frame: Frame, thing: Tensor, distance: float, light: Tensor | None) -> dict[str, Tensor]:
+    """Make particles of a thing (H, W) at one distance, with the image's colours as without ``light``."""
+    camera = frame.camera
+    step = max(1, round(_STEP * camera.height))
+    rows, columns = (step * thing[::step, ::step].nonzero()).unbind(-1)
+    rays = camera.rays(rows * camera.width + columns)
+    rgb = frame.load()[rows, columns, :3].float() / 255
+    if light is not None:
+        gain, bias = light
+        rgb = (rgb - bias) / gain
+    count, size = len(rows), torch.tensor(_ROUND * step * distance / camera.fx)
+    return {
+        "means": rays.origins + distance * rays.directions,
+        "scales": size.log().expand(count, 3).clone(),
+        "quaternions": torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1),
+        "opacity": torch.full((count, 1), _OPACITY),
+        "colors": ((rgb - 0.5) / FLAT)[:, None],
+    }

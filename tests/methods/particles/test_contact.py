@@ -1,0 +1,118 @@
+"""What moves in a film begins at the distance of the ground that it stands on."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from forewarp.methods.method import Start
+from forewarp.methods.particles.contact import set_down, things_on_the_ground
+from forewarp.methods.particles.model import Particles
+from forewarp.scene.frame import where_seen
+from tests.support.particles import BARE, MOVING, module_with, small_data
+
+DATA = small_data()
+FRAME = min(DATA.scene.train, key=lambda frame: abs(frame.time - DATA.scene.canonical_time))
+SIZE = FRAME.camera.height, FRAME.camera.width
+FARTHER = 3.0  # times the ball's distance, of the ground
+
+
+def masked(*boxes):
+    """A mask (H, W) bool of rectangles (top, bottom, left, right)."""
+    mask = torch.zeros(SIZE, dtype=torch.bool)
+    for top, bottom, left, right in boxes:
+        mask[top:bottom, left:right] = True
+    return mask
+
+
+def scene_with(mask, **more):
+    frames = [replace(frame, **{"load_moving": lambda: mask} | more) for frame in DATA.scene.train]
+    return replace(DATA.scene, train=tuple(frames))
+
+
+@pytest.fixture
+def before():
+    """A ball at rest, half of whose particles lie on a wall behind it."""
+    method = module_with(DATA, **BARE).method
+    rays = FRAME.camera.rays(torch.arange(SIZE[0] * SIZE[1]))
+    away = FARTHER * float((method.means.data - FRAME.camera.center.float()).norm(dim=-1).median())
+    count = len(method.means) // 2
+    wall = rays.origins + away * rays.directions
+    method.means.data[:count] = wall[torch.arange(count) % len(wall)]
+    return method, away
+
+
+def test_each_thing_stands_on_the_ground_below_it_unless_it_reaches_the_lower_edge():
+    frame = replace(FRAME, load_moving=lambda: masked((2, 8, 1, 5), (9, 14, 8, 13), (3, SIZE[0], 15, 19)))
+    depth = torch.full(SIZE, 9.0)
+    depth[8, 1:5], depth[14, 8:13] = 2.0, torch.tensor([5.0, 5.0, 0.0, 0.0, 5.0])  # not known everywhere
+    found = sorted(things_on_the_ground(frame, depth), key=lambda thing: thing[1])
+    assert [(int(mask.sum()), distance) for mask, distance in found] == [(24, 2.0), (25, 5.0)]
+    depth[8:] = 0.0
+    assert things_on_the_ground(frame, depth) == []  # no ground is known
+
+
+def test_particles_of_what_moves_are_replaced_at_the_distance_of_the_ground(before, monkeypatch):
+    method, away = before
+    mask = masked((6, 12, 6, 14))
+    monkeypatch.setattr(
+        "forewarp.methods.particles.contact.things_on_the_ground", lambda frame, depth: [(mask, away)]
+    )
+    old = {name: p.data.clone() for name, p in method.named_parameters(recurse=False)}
+    new = set_down(old, method, scene_with(mask))
+    moves = new.pop("set_down")
+    assert new.keys() == old.keys()
+    assert {len(value) for value in new.values()} == {len(moves)}
+    distances = (new["means"] - FRAME.camera.center.float()).norm(dim=-1)
+    torch.testing.assert_close(distances[moves], torch.full((int(moves.sum()),), away))
+    row, column, _ = where_seen(FRAME.camera, new["means"])
+    assert bool(mask[row, column][moves].all())
+    left = mask[row.clamp(0, SIZE[0] - 1), column.clamp(0, SIZE[1] - 1)] & ~moves
+    assert bool((distances[left] > 0.99 * away).all())  # nothing is left before it
+    drawn = (0.5 + 0.28209479 * new["colors"][moves, 0]).clamp(0, 1)
+    truth = FRAME.load()[row[moves], column[moves], :3] / 255
+    torch.testing.assert_close(drawn, truth, atol=1e-4, rtol=0.0)
+    row, column, _ = where_seen(FRAME.camera, old["means"])
+    outside = ~mask[row.clamp(0, SIZE[0] - 1), column.clamp(0, SIZE[1] - 1)]
+    behind = outside & ((old["means"] - FRAME.camera.center.float()).norm(dim=-1) > 0.99 * away)
+    kept = {tuple(place) for place in new["means"][~moves].tolist()}
+    assert {tuple(place) for place in old["means"][behind].tolist()} <= kept
+    assert len(old["means"]) > len(kept) >= int(behind.sum()) > 0
+
+
+@pytest.mark.parametrize("changes", [{"load_moving": None}, {"load_sensed": lambda: torch.ones(2, *SIZE)}])
+def test_without_masks_or_with_measured_depth_nothing_changes(before, changes):
+    method, _ = before
+    scene = scene_with(masked((6, 12, 6, 14)), **changes)
+    old = dict(method.named_parameters(recurse=False))
+    assert set_down(old, method, scene) is old
+
+
+@pytest.mark.parametrize("trusts", [True, False])
+def test_what_was_set_down_follows_nodes(before, trusts):
+    """Masks count only where the stage trusts them; what they show to move never rests."""
+    method, _ = before
+    rests = torch.ones(SIZE, dtype=torch.bool)
+    scene = scene_with(masked((6, 12, 6, 14)), load_resting=lambda: rests)
+    numbers = {"rest_by_masks": trusts}
+    start = Start(scene, "fine", numbers, list(range(len(scene.train))), None, method, False)
+    fine = Particles(start, **MOVING | {"background": 0.03})
+    count = len(fine.means) - len(method.means)
+    if trusts:
+        fresh = (fine.opacity.data[:, 0] == 2.0).nonzero()[:, 0]
+        assert len(fresh)
+        assert not bool(fine.resting[fresh].any())
+        assert bool((fine.skinning.shares[fresh].sum(-1) > 0.99).all())
+        assert bool(fine.resting.any())
+    else:
+        assert count == 0
+
+
+def test_a_checkpoint_is_loaded_without_a_look_at_masks(before):
+    def unread():
+        raise AssertionError("a mask was read")
+
+    method, _ = before
+    scene = scene_with(None, load_moving=unread)
+    start = Start(scene, "fine", {"rest_by_masks": True}, [0], None, method, True)
+    assert len(Particles(start, **MOVING).means) == len(method.means)
