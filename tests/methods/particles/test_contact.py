@@ -8,6 +8,7 @@ import torch
 from forewarp.methods.method import Start
 from forewarp.methods.particles.contact import set_down, things_on_the_ground
 from forewarp.methods.particles.model import Particles
+from forewarp.ops.gaussians import FLAT
 from forewarp.scene.frame import where_seen
 from tests.support.particles import BARE, MOVING, module_with, small_data
 
@@ -43,20 +44,22 @@ def before():
 
 
 def test_each_thing_stands_on_the_ground_below_it_unless_it_reaches_the_lower_edge():
-    frame = replace(FRAME, load_moving=lambda: masked((2, 8, 1, 5), (9, 14, 8, 13), (3, SIZE[0], 15, 19)))
+    moving = masked((2, 8, 1, 5), (9, 14, 8, 13), (3, SIZE[0], 15, 19))
     depth = torch.full(SIZE, 9.0)
     depth[8, 1:5], depth[14, 8:13] = 2.0, torch.tensor([5.0, 5.0, 0.0, 0.0, 5.0])  # not known everywhere
-    found = sorted(things_on_the_ground(frame, depth), key=lambda thing: thing[1])
+    found = sorted(things_on_the_ground(moving, depth), key=lambda thing: thing[1])
     assert [(int(mask.sum()), distance) for mask, distance in found] == [(24, 2.0), (25, 5.0)]
     depth[8:] = 0.0
-    assert things_on_the_ground(frame, depth) == []  # no ground is known
+    assert things_on_the_ground(moving, depth) == []  # no ground is known
 
 
-def test_particles_of_what_moves_are_replaced_at_the_distance_of_the_ground(before, monkeypatch):
+@pytest.mark.parametrize("light", [None, torch.tensor([[0.5] * 3, [0.1] * 3])])
+def test_particles_of_what_moves_are_replaced_at_the_distance_of_the_ground(before, monkeypatch, light):
     method, away = before
+    monkeypatch.setattr(method, "light", lambda moment: light)
     mask = masked((6, 12, 6, 14))
     monkeypatch.setattr(
-        "forewarp.methods.particles.contact.things_on_the_ground", lambda frame, depth: [(mask, away)]
+        "forewarp.methods.particles.contact.things_on_the_ground", lambda moving, depth: [(mask, away)]
     )
     old = {name: p.data.clone() for name, p in method.named_parameters(recurse=False)}
     new = set_down(old, method, scene_with(mask))
@@ -69,23 +72,34 @@ def test_particles_of_what_moves_are_replaced_at_the_distance_of_the_ground(befo
     assert bool(mask[row, column][moves].all())
     left = mask[row.clamp(0, SIZE[0] - 1), column.clamp(0, SIZE[1] - 1)] & ~moves
     assert bool((distances[left] > 0.99 * away).all())  # nothing is left before it
-    drawn = (0.5 + 0.28209479 * new["colors"][moves, 0]).clamp(0, 1)
-    truth = FRAME.load()[row[moves], column[moves], :3] / 255
-    torch.testing.assert_close(drawn, truth, atol=1e-4, rtol=0.0)
+    colors, truth = 0.5 + FLAT * new["colors"][moves, 0], FRAME.load()[row[moves], column[moves], :3] / 255
+    colors = colors if light is None else light[0] * colors + light[1]
+    torch.testing.assert_close(colors, truth, atol=1e-4, rtol=0.0)
     row, column, _ = where_seen(FRAME.camera, old["means"])
     outside = ~mask[row.clamp(0, SIZE[0] - 1), column.clamp(0, SIZE[1] - 1)]
     behind = outside & ((old["means"] - FRAME.camera.center.float()).norm(dim=-1) > 0.99 * away)
     kept = {tuple(place) for place in new["means"][~moves].tolist()}
     assert {tuple(place) for place in old["means"][behind].tolist()} <= kept
     assert len(old["means"]) > len(kept) >= int(behind.sum()) > 0
+    shared = torch.arange(len(old["means"]))  # a window leaves these as they are
+    new = set_down(old | {"shared": shared}, method, scene_with(mask))
+    assert torch.equal(new["shared"], torch.cat([shared, shared.new_full((int(moves.sum()),), -1)]))
 
 
-@pytest.mark.parametrize("changes", [{"load_moving": None}, {"load_sensed": lambda: torch.ones(2, *SIZE)}])
-def test_without_masks_or_with_measured_depth_nothing_changes(before, changes):
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"load_moving": None},
+        {"load_sensed": lambda: torch.ones(2, *SIZE)},
+        {"load_valid": lambda: torch.zeros(SIZE, dtype=torch.bool)},
+    ],
+)
+def test_without_masks_or_known_ground_or_with_measured_depth_nothing_changes(before, changes):
     method, _ = before
-    scene = scene_with(masked((6, 12, 6, 14)), **changes)
+    mask = masked((6, 12, 6, 14))
     old = dict(method.named_parameters(recurse=False))
-    assert set_down(old, method, scene) is old
+    assert set_down(old, method, scene_with(mask)) is not old
+    assert set_down(old, method, scene_with(mask, **changes)) is old
 
 
 @pytest.mark.parametrize("trusts", [True, False])

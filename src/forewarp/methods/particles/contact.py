@@ -13,8 +13,9 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from forewarp.ops.gaussians import FLAT
+from forewarp.methods.particles.start import first_values
 from forewarp.ops.grid import dilate
+from forewarp.scene.cloud import Cloud
 from forewarp.scene.frame import Frame, Scene, where_seen
 from forewarp.scene.view import Moment, View
 
@@ -56,26 +57,27 @@ def set_down(values: dict[str, Tensor], before: Particles, scene: Scene) -> dict
     camera, height = frame.camera, frame.camera.height
     moment = Moment(frame.time, camera=frame.camera_id, filmed=True)
     drawn = before.at(moment).render(View(camera), torch.zeros(3)).shaped(height, camera.width)
-    means, center = values["means"], camera.center.float()
+    means, moving = values["means"], frame.load_moving()
+    depth = torch.where(drawn.opacity > _SEEN, drawn.depth, 0.0)
+    if frame.load_valid is not None:
+        depth[~frame.load_valid()] = 0.0
+    step, edge = max(1, round(_STEP * height)), max(1, round(_EDGE * height))
     row, column, visible = where_seen(camera, means)
     row, column = row.clamp(0, height - 1), column.clamp(0, camera.width - 1)
-    away, gone = (means - center).norm(dim=-1), torch.zeros(len(means), dtype=torch.bool)
-    light, parts = before.light(moment), []
-    light = None if light is None else light.cpu()
-    depth = torch.where(drawn.opacity > _SEEN, drawn.depth, 0.0)
-    for thing, distance in things_on_the_ground(frame, depth):
-        part = _billboard(frame, thing, distance, light)
-        if len(part["means"]):
-            parts.append(part)
-            beside = dilate(thing, max(1, round(_EDGE * height))) & ~frame.load_moving()
+    away, gone = (means - camera.center.float()).norm(dim=-1), torch.zeros(len(means), dtype=torch.bool)
+    ground = torch.zeros_like(depth)  # of pixels on whose grid new particles lie
+    for thing, distance in things_on_the_ground(moving, depth):
+        if bool(thing[::step, ::step].any()):
+            ground[thing] = distance
+            beside = dilate(thing, edge) & ~moving
             gone |= visible & thing[row, column] & (away < _BEHIND * distance)
             gone |= visible & beside[row, column] & (away < _BESIDE * distance)
-    if not parts:
+    if not bool(ground.any()):
         return values
     if "shared" in values:
         gone &= values["shared"] < 0
-    fresh = {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
-    count, kept = len(fresh["means"]), {}
+    fresh, kept = _pieces(frame, ground, step, before.light(moment)), {}
+    count = len(fresh["means"])
     for name, value in values.items():
         if name == "exposure":
             kept[name] = value
@@ -86,11 +88,11 @@ def set_down(values: dict[str, Tensor], before: Particles, scene: Scene) -> dict
     return kept
 
 
-def things_on_the_ground(frame: Frame, depth: Tensor) -> list[tuple[Tensor, float]]:
+def things_on_the_ground(moving: Tensor, depth: Tensor) -> list[tuple[Tensor, float]]:
     """Tell the things that move in an image apart, and how far away the ground is that each stands on.
 
     Args:
-        frame: with a mask of what moves.
+        moving: (H, W) bool, what moves.
         depth: (H, W) distances along rays to what rests, world units, 0 where not known.
 
     Returns:
@@ -99,10 +101,7 @@ def things_on_the_ground(frame: Frame, depth: Tensor) -> list[tuple[Tensor, floa
     """
     from scipy.ndimage import label  # late, as its import takes time
 
-    moving, height = frame.load_moving(), len(depth)
-    if frame.load_valid is not None:
-        depth = torch.where(frame.load_valid(), depth, 0.0)
-    labels, found = torch.from_numpy(label(moving.numpy(), torch.ones(3, 3))[0]), []
+    height, labels, found = len(depth), torch.from_numpy(label(moving.numpy(), torch.ones(3, 3))[0]), []
     counts, below = labels.flatten().bincount(), max(1, round(_BELOW * height))
     for number in (counts >= _SMALLEST * labels.numel()).nonzero()[:, 0].tolist():
         thing = labels == number
@@ -120,21 +119,21 @@ def things_on_the_ground(frame: Frame, depth: Tensor) -> list[tuple[Tensor, floa
     return found
 
 
-def _billboard(frame: Frame, thing: Tensor, distance: float, light: Tensor | None) -> dict[str, Tensor]:
-    """Make particles of a thing (H, W) at one distance, with the image's colours as without ``light``."""
+def _pieces(frame: Frame, ground: Tensor, step: int, light: Tensor | None) -> dict[str, Tensor]:
+    """Make particles at the distances (H, W), not 0, of every ``step``-th pixel, coloured like an image
+    without its ``light``.
+    """
     camera = frame.camera
-    step = max(1, round(_STEP * camera.height))
-    rows, columns = (step * thing[::step, ::step].nonzero()).unbind(-1)
-    rays = camera.rays(rows * camera.width + columns)
-    rgb = frame.load()[rows, columns, :3].float() / 255
+    rows, columns = (step * ground[::step, ::step].nonzero()).unbind(-1)
+    rays, distance = camera.rays(rows * camera.width + columns), ground[rows, columns]
+    colors = frame.load()[rows, columns, :3].float() / 255
     if light is not None:
-        gain, bias = light
-        rgb = (rgb - bias) / gain
-    count, size = len(rows), torch.tensor(_ROUND * step * distance / camera.fx)
-    return {
-        "means": rays.origins + distance * rays.directions,
-        "scales": size.log().expand(count, 3).clone(),
-        "quaternions": torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1),
-        "opacity": torch.full((count, 1), _OPACITY),
-        "colors": ((rgb - 0.5) / FLAT)[:, None],
-    }
+        gain, bias = light.cpu()
+        colors = (colors - bias) / gain
+    spacing = step * distance / camera.fx
+    cloud = Cloud(
+        rays.origins + distance[:, None] * rays.directions, colors, distance, float(spacing.median())
+    )
+    values = first_values(cloud, _ROUND * spacing)
+    values["opacity"] += _OPACITY
+    return values
