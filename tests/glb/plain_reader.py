@@ -167,7 +167,7 @@ class PlainScene:
         primitive = document["meshes"][node["mesh"]]["primitives"][0]
         about = primitive["extensions"][SPLATS]["extensions"][MOTION]
         assert about["version"].split(".")[0] == "1"
-        assert {*about.get("features", [])} <= {"windows"}
+        assert {*about.get("features", [])} <= {"windows", "quaternions"}
         self.windows = [PlainWindow(document, blob, primitive, about)]
         self.limits, self.fade = [(0.0, 0.0, 1.0)], 0.0  # shown from; its own times 0 and 1
         if "windows" in about:
@@ -245,12 +245,13 @@ class PlainWindow:
             basis = cosines(time, *numbers) - cosines(self.about["canonicalTime"], *numbers)
         places = self.nodes["positions"]
         v = np.einsum("k,mkx->mx", basis, self.nodes["translations"].reshape(-1, count, 3))
-        r = np.zeros_like(v)
+        r, w = np.zeros_like(v), np.ones((len(v), 1, 1))
         if "rotations" in self.nodes:
-            r = np.einsum("k,mkx->mx", basis, self.nodes["rotations"].reshape(-1, count, 3))
+            r = np.einsum("k,mkx->mx", basis, self.nodes["rotations"].reshape(len(v), count, -1))
+            w, r = w + r[:, 3:].sum(1)[:, None, None], r[:, :3]
         square = (r**2).sum(1)[:, None, None]
         cross = np.stack([np.cross(r, axis) for axis in np.eye(3)], 2)
-        turns = 2 * (r[:, :, None] * r[:, None] - square * np.eye(3) + cross) / (1 + square)
+        turns = 2 * (r[:, :, None] * r[:, None] - square * np.eye(3) + w * cross) / (w**2 + square)
         return turns, v - np.einsum("mxy,my->mx", turns, places)
 
     def gaussians(self, time, eye):

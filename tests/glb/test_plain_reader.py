@@ -38,16 +38,16 @@ def assert_alike(plain, scene, cameras, least=70):
 
 
 @pytest.mark.parametrize(
-    ("curve", "without"),
+    ("curve", "without", "numbers"),
     [
-        (NATURAL, []),
-        (NATURAL | {"count": 2}, ["timeOffsets", "colorOverTime"]),
-        ({"kind": "spline", "count": 6, "frames": 9}, ["opacityOverTime", "opacityLogits"]),
-        (COSINES, ["timeOffsets"]),
+        (NATURAL, [], 3),
+        (NATURAL | {"count": 2}, ["timeOffsets", "colorOverTime"], 4),
+        ({"kind": "spline", "count": 6, "frames": 9}, ["opacityOverTime", "opacityLogits"], 3),
+        (COSINES, ["timeOffsets"], 4),
     ],
 )
-def test_a_file_written_by_the_page_is_drawn_alike(tmp_path, curve, without):
-    file = write_scene(tmp_path / "scene.glb", curve, without)
+def test_a_file_written_by_the_page_is_drawn_alike(tmp_path, curve, without, numbers):
+    file = write_scene(tmp_path / "scene.glb", curve, without, numbers)
     scene = load(file)
     assert_alike(PlainScene(file), scene, scene.cameras)
 
@@ -81,7 +81,7 @@ def test_groups_of_deltas_are_as_in_the_text_of_the_extension():
     assert (values, end) == ([-1, -4, -3, 26, -91, 0, -6, 6, -4, -4, 5, -5, 1, -1, 0, 0], 10)
 
 
-def write_scene(path, curve, without, seed=0):
+def write_scene(path, curve, without, numbers, seed=0):
     """Write a file of random Gaussians by the page: 40 move, 20 rest; return its path."""
     random, n, moving, m, k = np.random.default_rng(seed), 60, 40, 6, curve["count"]
     normal, uniform = random.standard_normal, random.uniform
@@ -119,7 +119,9 @@ def write_scene(path, curve, without, seed=0):
     motion = {"version": "1.7", "later": 1, "canonicalTime": 0.3, "moving": moving, "curve": curve}
     motion |= {"blur": 0.3, "background": [0.2, 0.5, 0.9]}
     motion["nodes"] = {"positions": accessor(uniform(-1, 1, (m, 3)))}
-    motion["nodes"] |= {name: accessor(0.3 * normal((m * k, 3))) for name in ("translations", "rotations")}
+    motion["nodes"] |= {"translations": accessor(0.3 * normal((m * k, 3)))}
+    motion["nodes"] |= {"rotations": accessor(0.3 * normal((m * k, numbers)))}
+    motion["features"] = ["quaternions"] if numbers == 4 else []
     motion["links"] = [accessor(random.integers(0, m, (moving, 4)).astype(np.uint8)) for _ in range(2)]
     motion["weights"] = [accessor(values, normalized=True) for values in shares]
     motion["timeOffsets"] = {"times": accessor([0.1, 0.4, 0.9]), "offsets": accessor([-0.15, 0.1, 0.2])}

@@ -10,9 +10,9 @@ from forewarp.ops import nodes
 F64 = torch.float64
 
 
-def some(count=7, dtype=F64, seed=0):
+def some(count=7, dtype=F64, seed=0, numbers=6):
     generator = torch.Generator().manual_seed(seed)
-    motion = 0.5 * torch.randn(count, 6, generator=generator, dtype=F64)
+    motion = 0.5 * torch.randn(count, numbers, generator=generator, dtype=F64)
     places = torch.randn(count, 3, generator=generator, dtype=F64)
     edges = torch.randint(0, count, (count, 3), generator=generator)
     weights = torch.rand(count, 3, generator=generator, dtype=F64)
@@ -30,8 +30,9 @@ def test_hand_worked():
     assert not bool(nodes.node_maps(torch.zeros(3, 6), torch.randn(3, 3)).any())
 
 
-def test_maps_are_rigid():
-    motion, places, *_ = some(20)
+@pytest.mark.parametrize("numbers", [6, 7])
+def test_maps_are_rigid(numbers):
+    motion, places, *_ = some(20, numbers=numbers)
     rotations = nodes.node_maps(motion, places)[:, :9].reshape(-1, 3, 3) + torch.eye(3)
     torch.testing.assert_close(rotations @ rotations.mT, torch.eye(3, dtype=F64).expand(20, 3, 3))
 
@@ -47,8 +48,9 @@ def test_what_moves_rigidly_together_is_not_strained():
     assert float(nodes.stiffness(motion, places, edges, weights)) > 1e-4
 
 
-def test_pull_of_the_kernel_equals_autograd():
-    motion, places, edges, weights = some(30)
+@pytest.mark.parametrize("numbers", [6, 7])
+def test_pull_of_the_kernel_equals_autograd(numbers):
+    motion, places, edges, weights = some(30, numbers=numbers)
     by_maps = torch.randn(30, 12, dtype=F64)
     exact, strain = nodes.pull_nodes(motion, places, by_maps, edges, weights, 0.7)
     singles = (motion.float(), places.float(), by_maps.float(), edges, weights.float())
@@ -64,23 +66,27 @@ def test_nodes_that_coincide(backend):
     assert math.isfinite(strain)
 
 
-@pytest.mark.parametrize("rotates", [True, False])
+@pytest.mark.parametrize("rotates", [3, 4, False])
 def test_curves_carry_nodes(backend, rotates):
     _, places, *_ = some(5, torch.float32)
-    shift, rotation, basis = torch.randn(5, 4, 3), torch.randn(5, 4, 3), torch.tensor([0.0, 0.5, -1.0, 0.0])
+    shift, rotation, basis = (
+        torch.randn(5, 4, 3),
+        torch.randn(5, 4, rotates or 3),
+        torch.tensor([0.0, 0.5, -1.0, 0.0]),
+    )
     motion, maps = nodes.carry_nodes(shift, rotation if rotates else None, basis, places)
     torch.testing.assert_close(motion[:, :3], 0.5 * shift[:, 1] - shift[:, 2])
-    torch.testing.assert_close(motion[:, 3:], (0.5 * rotation[:, 1] - rotation[:, 2]) * rotates)
+    torch.testing.assert_close(motion[:, 3:], (0.5 * rotation[:, 1] - rotation[:, 2]) * bool(rotates))
     torch.testing.assert_close(maps, nodes.node_maps(motion, places))
 
 
-@pytest.mark.parametrize("rotates", [True, False])
+@pytest.mark.parametrize("rotates", [3, 4, False])
 def test_spread_over_curves_equals_autograd(backend, rotates):
-    shift, rotation = (torch.randn(5, 7, 3, requires_grad=True) for _ in range(2))
-    by_motion, basis, bend = torch.randn(5, 6), torch.rand(7), torch.randn(7)
+    shift, rotation = (torch.randn(5, 7, n, requires_grad=True) for n in (3, rotates or 3))
+    by_motion, basis, bend = torch.randn(5, 3 + (rotates or 3)), torch.rand(7), torch.randn(7)
     loss = value = 0.0
     both = (shift, by_motion[:, :3], 2.0), (rotation, by_motion[:, 3:], 1.0)
-    for curve, own, unit in both[: 1 + rotates]:
+    for curve, own, unit in both[: 1 + bool(rotates)]:
         squared = (torch.einsum("mkc,k->mc", curve, bend) / unit).square().mean()
         loss = loss + (torch.einsum("mkc,k->mc", curve, basis) * own).sum() + 3.0 * squared
         value += float(squared.detach())

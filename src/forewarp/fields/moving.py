@@ -188,7 +188,8 @@ class NodeMotion:
     Attributes:
         positions: world units.
         translations: (M, K, 3), coefficients of the ``curve``, world units.
-        rotations: (M, K, 3) likewise of Gibbs vectors; None where nodes do not rotate.
+        rotations: (M, K, 3) likewise of Gibbs vectors, or (M, K, 4) of quaternions, see ``ops.nodes``; None
+            where nodes do not rotate.
         curve: the curve of every node.
         links, weights: (N, L) of N Gaussians: rows of nodes, int32, and their shares, which sum to 1, or are
             all 0 of one at rest.
@@ -318,8 +319,8 @@ class MovingGaussians:
         nodes in ``links`` (N, L), w ``weights`` (N, L) and ``D | d`` the nodes' ``maps`` (T, M, 3, 4).
         ``color_over_time`` (N, K, 3), by ``color_basis`` (T, K), is added to the colour, and
         ``opacity_over_time`` (N, F), by ``opacity_basis`` (T, F), to the opacity's logit. The maps come of
-        ``node_shift`` and ``node_turn`` (M, B, 3), by ``node_basis`` (T, B), about ``node_places`` (M, 3).
-        What is off is absent.
+        ``node_shift`` (M, B, 3) and ``node_turn`` (M, B, 3 or 4), by ``node_basis`` (T, B), about
+        ``node_places`` (M, 3). What is off is absent.
         """
         parts, motion = {}, self.motion
         if motion is not None:

@@ -18,13 +18,13 @@ from forewarp.fields.windows import MovingWindows, Window, check_windows, taken,
 from forewarp.files import MOST_CONFIG, read_bytes
 from forewarp.glb import meshopt
 from forewarp.glb.container import CAMERA_AXES, CHUNKS, COMPONENTS, COMPRESSION, ELEMENTS, MAGIC, VERSION
-from forewarp.glb.writer import FORMAT, MOTION, SPLATS, WINDOWS, Setting
+from forewarp.glb.writer import FORMAT, MOTION, QUATERNIONS, SPLATS, WINDOWS, Setting
 from forewarp.ops.backend import is_number
 from forewarp.ops.gaussians import LEAST_LOG
 from forewarp.scene.camera import Camera, Lens
 
 _EXTENSIONS = COMPRESSION, SPLATS, MOTION  # that a file may require
-_FEATURES = (WINDOWS,)  # names that a file may list of what a reader must know
+_FEATURES = (WINDOWS, QUATERNIONS)  # names that a file may list of what a reader must know
 # At most: degree of the harmonics, cosines over time, accessors of links.
 _MOST = 1 << 28  # bytes of the file, and of all its arrays: some 200,000 particles of degree 3
 _DEGREES, _COSINES, _LINKS = 3, 64, 16
@@ -146,7 +146,7 @@ class Container:
         Args:
             part: of the description.
             key: of its property that has the accessor's number.
-            kind: ``SCALAR``, ``VEC3`` or ``VEC4``.
+            kind: ``SCALAR``, ``VEC3`` or ``VEC4``; or several of them, with `` or `` between.
             count: of its rows; None: as it says.
         """
         return self._rows(part.content.get(key), kind, count, f"{part.place}.{key}")
@@ -159,11 +159,12 @@ class Container:
         if type(number) is not int or not 0 <= number < len(self.accessors):
             got = short(number)
             raise ValueError(f"{place}: expected one of {len(self.accessors)} accessors, but got {got}")
-        accessor, width = self.accessors[number], {name: n for n, name in ELEMENTS.items()}[kind]
-        rows = accessor.whole("count", 1, _MOST)
-        if accessor.text("type") != kind or (count is not None and rows != count):
+        accessor = self.accessors[number]
+        rows, came = accessor.whole("count", 1, _MOST), accessor.text("type")
+        if came not in kind.split(" or ") or (count is not None and rows != count):
             wanted = f"{'rows' if count is None else count} of {kind}"
-            raise ValueError(f"{place}: expected {wanted}, but got {rows} of {accessor.text('type')}")
+            raise ValueError(f"{place}: expected {wanted}, but got {rows} of {came}")
+        width = {name: n for n, name in ELEMENTS.items()}[came]
         component = COMPONENTS.get(accessor.whole("componentType", 0, 2**16))
         if component is None or "sparse" in accessor:
             raise ValueError(f"{accessor.place}: expected plain numbers of 8, 16 or 32 bits, but got others")
@@ -386,11 +387,13 @@ def _motion(container: Container, motion: Fields, canonical_time: float, count: 
     if kind == "cosines":
         about.fixed("padding", PADDING)
 
-    def curves(key: str) -> torch.Tensor:
-        values = container.array(nodes, key, "VEC3", len(positions) * number)
-        return _floats(values).reshape(-1, number, 3)
+    def curves(key: str, kind: str = "VEC3") -> torch.Tensor:
+        values = container.array(nodes, key, kind, len(positions) * number)
+        return _floats(values).reshape(len(positions), number, -1)
 
-    translations, rotations = curves("translations"), curves("rotations") if "rotations" in nodes else None
+    translations, rotations = curves("translations"), None
+    if "rotations" in nodes:
+        rotations = curves("rotations", "VEC3 or VEC4")
     links, weights = _links(container, motion, moving, len(positions))
     padded = torch.zeros(2, count, links.shape[1])
     padded[0, :moving], padded[1, :moving] = links, weights

@@ -22,6 +22,7 @@ from forewarp.scene.camera import Camera
 SPLATS, MOTION = "KHR_gaussian_splatting", "FOREWARP_gaussian_motion"
 FORMAT = "1.1"
 WINDOWS = "windows"  # a feature, and the property that describes it
+QUATERNIONS = "quaternions"  # a feature: rotations of nodes have four numbers
 COMPACT, LOSSLESS = "compact", "lossless"
 _LEAST_NEAR = 1e-6  # of a camera's far plane: glTF's near plane lies in front of the camera
 _SLOTS = 4  # links in an accessor
@@ -64,7 +65,8 @@ def write(windows: Sequence[tuple[Window, Rows]], setting: Setting, quality: str
         about = [{"span": list(span), "from": begin} for begin, span in zip(begins, spans)]
         for number, window in enumerate(about[1:], 1):
             window["mesh"] = number
-        motion["features"] = [WINDOWS]
+        needed = [p["extensions"][SPLATS]["extensions"][MOTION]["features"] for p in primitives]
+        motion["features"] = sorted({*sum(needed, []), WINDOWS})
         motion[WINDOWS] = {"shared": shared, "fade": longest_fade(begins, spans), "list": about}
     cameras = [_camera(camera) for camera in setting.cameras]
     for camera, time in zip(cameras, setting.times):
@@ -89,7 +91,7 @@ def _primitive(store: _Store, cameras: Sequence[Camera], gaussians: MovingGaussi
     motion |= {"blur": gaussians.blur} | _over_time(store, gaussians, order)
     motion |= {"moving": moving, "inMotion": in_motion}
     if moving:
-        motion |= _motion(store, pixel, gaussians.motion, order[:moving])
+        motion |= _motion(store, pixel, gaussians.motion, order[:moving], motion["features"])
     splats = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display", "projection": "perspective"}
     splats |= {"sortingMethod": "cameraDistance", "extensions": {MOTION: motion}}
     return {"mode": 0, "attributes": attributes, "extensions": {SPLATS: splats}}
@@ -275,13 +277,15 @@ def _over_time(store: _Store, gaussians: MovingGaussians, order: np.ndarray) -> 
     return parts
 
 
-def _motion(store: _Store, pixel: float, motion: NodeMotion, rows: np.ndarray) -> dict:
-    """Store the nodes, and what the particles in ``rows`` follow."""
+def _motion(store: _Store, pixel: float, motion: NodeMotion, rows: np.ndarray, features: list[str]) -> dict:
+    """Store the nodes, and what particles in ``rows`` follow; add to ``features`` what readers must know."""
     curve, count = motion.curve, motion.translations.shape[1]
     nodes = {"positions": store.stepped(motion.positions.numpy(), _LENGTH * pixel)}
     nodes["translations"] = store.stepped(motion.translations.reshape(-1, 3).numpy(), _CURVE * pixel)
     if motion.rotations is not None:
-        nodes["rotations"] = store.stepped(motion.rotations.reshape(-1, 3).numpy(), _GIBBS)
+        if motion.rotations.shape[2] == 4:
+            features.append(QUATERNIONS)
+        nodes["rotations"] = store.stepped(motion.rotations.flatten(0, 1).numpy(), _GIBBS)
     about = {"kind": curve.kind, "count": count, "frames": curve.times}
     about |= {"natural": curve.straight} if curve.kind == "spline" else {"padding": PADDING}
     parts = {"nodes": nodes, "curve": about}

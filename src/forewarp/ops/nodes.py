@@ -14,15 +14,24 @@ _PULLED = f"{_EDGES}, by_maps (M, 12)"
 _SMALL = 0.05  # radian; below, series in the squared angle are exact to single precision
 
 
+def _check(shapes: str, turns: Tensor, *tensors: Tensor) -> None:
+    """Check shapes: if ``turns``, motion or rotations, has a fourth number of these, all have."""
+    if turns.shape[-1] in (4, 7):
+        shapes = shapes.replace("(M, 6)", "(M, 7)").replace("rotation (M, K, 3)", "rotation (M, K, 4)")
+    check_shapes(shapes, *tensors)
+
+
 def node_maps(motion: Tensor, places: Tensor) -> Tensor:
     """Return what nodes do to points around them, less the identity.
 
     A point x beside a node at p goes to ``R (x - p) + p + v``. ``R`` is that of the Gibbs vector r, whose
     length is the tangent of half the angle: ``R - I = D = 2 (r r^t - |r|^2 I + [r]x) / (1 + |r|^2)``: no
-    trigonometry, smooth at 0. The map is ``x + D x + d`` with ``d = v - D p``.
+    trigonometry, smooth at 0. The map is ``x + D x + d`` with ``d = v - D p``. A Gibbs vector is infinite at
+    half a turn. With one number w more, ``R`` is that of the quaternion ``(1 + w, r)`` of any length, and
+    turns without end: ``D = 2 (r r^t - |r|^2 I + (1 + w) [r]x) / ((1 + w)^2 + |r|^2)``.
 
     Args:
-        motion: (M, 6), v in world units and r.
+        motion: (M, 6), v in world units and r; or (M, 7), and w.
         places: (M, 3) the rest positions, world units.
 
     Returns:
@@ -36,14 +45,15 @@ def node_maps(motion: Tensor, places: Tensor) -> Tensor:
     >>> node_maps(torch.tensor([[0.0, 0.0, 1.0, 0.0, 0.0, 0.0]]), torch.ones(1, 3))[0, 9:]
     tensor([0., 0., 1.])
     """
-    check_shapes("motion (M, 6), places (M, 3)", motion, places)
-    shift, gibbs = motion[:, :3], motion[:, 3:]
+    _check("motion (M, 6), places (M, 3)", motion, motion, places)
+    shift, gibbs, more = motion[:, :3], motion[:, 3:6], motion[:, 6:]
     x, y, z = gibbs.unbind(-1)
+    scalar = 1 + more.sum(-1)[:, None, None]
     zero, square = torch.zeros_like(x), gibbs.square().sum(-1)
     across = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).reshape(-1, 3, 3)
     eye = torch.eye(3).to(motion)
-    linear = gibbs[:, :, None] * gibbs[:, None] - square[:, None, None] * eye + across
-    linear = linear * (2 / (1 + square))[:, None, None]
+    linear = gibbs[:, :, None] * gibbs[:, None] - square[:, None, None] * eye + scalar * across
+    linear = linear * (2 / (scalar.square() + square[:, None, None]).clamp(min=LEAST))
     rest = shift - (linear @ places[..., None])[..., 0]
     return torch.cat([linear.reshape(-1, 9), rest], -1)
 
@@ -51,10 +61,10 @@ def node_maps(motion: Tensor, places: Tensor) -> Tensor:
 def carry_nodes(
     shift: Tensor, rotation: Tensor | None, basis: Tensor, places: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Carry nodes along their curves to a time: ``motion`` (M, 6) and its ``node_maps`` (M, 12).
+    """Carry nodes along their curves to a time: ``motion`` (M, 6) or (M, 7), and its ``node_maps`` (M, 12).
 
     Args:
-        shift, rotation: (M, K, 3) coefficients; None where nothing rotates.
+        shift, rotation: (M, K, 3) coefficients, of rotations also (M, K, 4); None where nothing rotates.
         basis: (K,) of the time.
         places: (M, 3).
 
@@ -65,12 +75,13 @@ def carry_nodes(
     """
     curves = [shift] if rotation is None else [shift, rotation]
     shapes = "places (M, 3), basis (K), shift (M, K, 3), rotation (M, K, 3)"
-    check_shapes(shapes, places, basis, shift, curves[-1])
+    _check(shapes, curves[-1], places, basis, shift, curves[-1])
     asks = torch.is_grad_enabled() and any(curve.requires_grad for curve in curves)
     if use_numba(shift) and shift.dtype == torch.float32 and not asks:
         from forewarp.ops.kernels import nodes as kernels
 
-        motion, maps = shift.new_empty(len(places), 6), shift.new_empty(len(places), 12)
+        motion = shift.new_empty(len(places), 3 + curves[-1].shape[2])
+        maps = shift.new_empty(len(places), 12)
         pair = (shift, shift[:0] if rotation is None else rotation)
         kernels.carry(*arrays(*pair, basis, places, motion, maps))
         return motion, maps
@@ -95,7 +106,7 @@ def stiffness(motion: Tensor, places: Tensor, edges: Tensor, weights: Tensor) ->
 
     Cost: about 40 operations an edge.
     """
-    check_shapes(_EDGES, motion, places, edges, weights)
+    _check(_EDGES, motion, motion, places, edges, weights)
     linear = node_maps(motion, places)[:, :9].reshape(-1, 3, 3)
     apart = places[edges] - places[:, None]
     strain = motion[edges, :3] - motion[:, None, :3] - (linear[:, None] @ apart[..., None])[..., 0]
@@ -113,14 +124,14 @@ def pull_nodes(
         factor: of the stiffness.
 
     Returns:
-        gradients (M, 6), and the stiffness itself.
+        gradients as ``motion``, and the stiffness itself.
 
     Raises:
         ValueError: for shapes that do not go together.
 
     Cost: about 60 operations an edge.
     """
-    check_shapes(_PULLED, motion, places, edges, weights, by_maps)
+    _check(_PULLED, motion, motion, places, edges, weights, by_maps)
     if use_numba(motion) and motion.dtype == torch.float32:
         from forewarp.ops.kernels import nodes as kernels
 
@@ -144,14 +155,14 @@ def spread_nodes(
     loss is ``factor mean b^2``, once for ``shift`` and once for ``rotation``.
 
     Args:
-        shift, rotation: (M, K, 3) coefficients; None where nothing rotates.
-        by_motion: (M, 6) gradients by ``motion``.
+        shift, rotation: (M, K, 3) coefficients, of rotations also (M, K, 4); None where nothing rotates.
+        by_motion: (M, 6) or (M, 7), gradients by ``motion``.
         basis, bend: (K,) of the time; of its second difference.
         factor: of the squared bend.
         unit: a length, world units.
 
     Returns:
-        gradients by ``shift`` and by ``rotation`` (M, K, 3), and the mean of b^2, both kinds together.
+        gradients by ``shift`` and by ``rotation``, and the mean of b^2, both kinds together.
 
     Raises:
         ValueError: for shapes that do not go together.
@@ -159,7 +170,8 @@ def spread_nodes(
     Cost: about 20 operations a coefficient.
     """
     shapes = "shift (M, K, 3), rotation (M, K, 3), by_motion (M, 6), basis (K), bend (K)"
-    check_shapes(shapes, shift, shift if rotation is None else rotation, by_motion, basis, bend)
+    turns = shift if rotation is None else rotation
+    _check(shapes, turns, shift, turns, by_motion, basis, bend)
     gradients, total = [], 0.0
     for curve, by_curve, scale in ((shift, by_motion[:, :3], unit), (rotation, by_motion[:, 3:], 1.0)):
         if curve is None:

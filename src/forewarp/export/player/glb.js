@@ -1,6 +1,6 @@
 // Read scene.glb (docs/format.md): a glTF 2.0 binary of Gaussians, with the motion beside them.
 
-const KNOWN_FEATURES = ["windows"];
+const KNOWN_FEATURES = ["windows", "quaternions"];
 const COMPONENTS = {
   5120: [Int8Array, 127], 5121: [Uint8Array, 255], 5122: [Int16Array, 32767],
   5123: [Uint16Array, 65535], 5125: [Uint32Array, 1], 5126: [Float32Array, 1],

@@ -45,19 +45,19 @@ function nodeMaps(scene, time, maps) {
   const { nodes, curve, canonicalTime } = scene, at = motionTime(scene, time);
   const spline = curve.kind === "spline";
   const shares = spline ? splineShares(at, curve.count, curve.natural) : cosineShares(at, curve, canonicalTime);
-  const used = [...shares.keys()].filter((k) => shares[k]), sum = (values, from) => {
+  const used = [...shares.keys()].filter((k) => shares[k]), sum = (values, width, m, i) => {
     let total = 0;
-    for (const k of used) total += shares[k] * values[from + 3 * k];
+    for (const k of used) total += shares[k] * values[width * (m * curve.count + k) + i];
     return total;
   };
+  const turn = nodes.rotations, numbers = turn ? turn.length / (nodes.count * curve.count) : 0;
   for (let m = 0; m < nodes.count; m++) {
-    const from = 3 * m * curve.count, turn = nodes.rotations;
-    const x = turn ? sum(turn, from) : 0, y = turn ? sum(turn, from + 1) : 0, z = turn ? sum(turn, from + 2) : 0;
-    const s = 2 / (1 + x * x + y * y + z * z);
+    const [x, y, z, more] = [0, 1, 2, 3].map((i) => (i < numbers ? sum(turn, numbers, m, i) : 0));
+    const w = 1 + more, s = 2 / Math.max(w * w + x * x + y * y + z * z, 1e-20);
     const rows = [
-      -s * (y * y + z * z), s * (x * y - z), s * (x * z + y),
-      s * (x * y + z), -s * (x * x + z * z), s * (y * z - x),
-      s * (x * z - y), s * (y * z + x), -s * (x * x + y * y),
+      -s * (y * y + z * z), s * (x * y - w * z), s * (x * z + w * y),
+      s * (x * y + w * z), -s * (x * x + z * z), s * (y * z - w * x),
+      s * (x * z - w * y), s * (y * z + w * x), -s * (x * x + y * y),
     ];
     const [px, py, pz] = nodes.positions.subarray(3 * m, 3 * m + 3);
     for (let i = 0; i < 3; i++) {
@@ -65,7 +65,7 @@ function nodeMaps(scene, time, maps) {
       maps[to] = a;
       maps[to + 1] = b;
       maps[to + 2] = c;
-      maps[to + 3] = sum(nodes.translations, from + i) - (a * px + b * py + c * pz);
+      maps[to + 3] = sum(nodes.translations, 3, m, i) - (a * px + b * py + c * pz);
     }
   }
 }

@@ -25,23 +25,24 @@ _LEAST = np.float32(LEAST)
 
 @njit(inline="always")
 def _linear(motion, m, out):
-    """``D`` (9) of a node; returns the factor 2 / (1 + |r|^2)."""
+    """``D`` (9) of a node; returns 1 + w, and the factor 2 / ((1 + w)^2 + |r|^2)."""
     x, y, z = motion[m, 3], motion[m, 4], motion[m, 5]
+    a = 1.0 + motion[m, 6] if motion.shape[1] > 6 else 1.0
     square = x * x + y * y + z * z
-    s = 2.0 / (1.0 + square)
-    out[0], out[1], out[2] = s * (x * x - square), s * (x * y - z), s * (x * z + y)
-    out[3], out[4], out[5] = s * (x * y + z), s * (y * y - square), s * (y * z - x)
-    out[6], out[7], out[8] = s * (x * z - y), s * (y * z + x), s * (z * z - square)
-    return s
+    s = 2.0 / max(a * a + square, _LEAST)
+    out[0], out[1], out[2] = s * (x * x - square), s * (x * y - a * z), s * (x * z + a * y)
+    out[3], out[4], out[5] = s * (x * y + a * z), s * (y * y - square), s * (y * z - a * x)
+    out[6], out[7], out[8] = s * (x * z - a * y), s * (y * z + a * x), s * (z * z - square)
+    return a, s
 
 
 @njit(cache=True)
 def pull(motion, places, by_maps, edges, weights, gradient, factor):
-    """Add to ``gradient`` (M, 6); returns the stiffness. See ``nodes.pull_nodes``."""
+    """Add to ``gradient``, of the shape of ``motion``; returns the stiffness. See ``nodes.pull_nodes``."""
     linear, by_linear, apart, strain = np.empty(9), np.empty(9), np.empty(3), np.empty(3)
     total = 0.0
     for m in range(motion.shape[0]):
-        s = _linear(motion, m, linear)
+        a, s = _linear(motion, m, linear)
         for r in range(3):
             gradient[m, r] += by_maps[m, 9 + r]
             for c in range(3):
@@ -72,23 +73,25 @@ def pull(motion, places, by_maps, edges, weights, gradient, factor):
         )
         across, gibbs = (d[7] - d[5], d[2] - d[6], d[3] - d[1]), (x, y, z)
         for r in range(3):
-            gradient[m, 3 + r] += s * (by[r] - 2.0 * trace * gibbs[r] + across[r] - along * gibbs[r])
+            gradient[m, 3 + r] += s * (by[r] - 2.0 * trace * gibbs[r] + a * across[r] - along * gibbs[r])
+        if motion.shape[1] > 6:
+            gradient[m, 6] += s * (x * across[0] + y * across[1] + z * across[2] - along * a)
     return total
 
 
 @njit(cache=True)
 def carry(shift, rotation, basis, places, motion, maps):
-    """Fill ``motion`` (M, 6) and ``maps`` (M, 12), as ``nodes.carry_nodes``; ``rotation`` may be empty."""
+    """Fill ``motion`` and ``maps`` (M, 12), as ``nodes.carry_nodes``; ``rotation`` may be empty."""
     linear = np.empty(9)
     for m in range(shift.shape[0]):
-        for c in range(3):
-            shifted, rotated = 0.0, 0.0
-            for k in range(shift.shape[1]):
-                if basis[k] != 0:
-                    shifted += basis[k] * shift[m, k, c]
-                    if len(rotation):
-                        rotated += basis[k] * rotation[m, k, c]
-            motion[m, c], motion[m, 3 + c] = shifted, rotated
+        motion[m] = 0.0
+        for k in range(shift.shape[1]):
+            if basis[k] != 0:
+                for c in range(3):
+                    motion[m, c] += basis[k] * shift[m, k, c]
+                if len(rotation):
+                    for c in range(rotation.shape[2]):
+                        motion[m, 3 + c] += basis[k] * rotation[m, k, c]
         _linear(motion, m, linear)
         for r in range(3):
             rest = motion[m, r]
@@ -100,10 +103,10 @@ def carry(shift, rotation, basis, places, motion, maps):
 
 @njit(cache=True, error_model="numpy")
 def spread(value, by_motion, basis, bend, gradient, factor, scale):
-    """Fill ``gradient`` (M, K, 3); returns the mean of the squared bend. See ``nodes.spread_nodes``."""
-    total, count = 0.0, 3 * value.shape[0]
+    """Fill ``gradient``, as ``value`` (M, K, C); returns the mean of b^2. See ``nodes.spread_nodes``."""
+    total, count = 0.0, value.shape[0] * value.shape[2]
     for m in range(value.shape[0]):
-        for c in range(3):
+        for c in range(value.shape[2]):
             bent = 0.0
             for k in range(value.shape[1]):
                 if bend[k] != 0:
