@@ -408,8 +408,13 @@ def test_the_page_of_a_run_looks_as_the_run_renders_it(tab_of, ok, fitted, tmp_p
 @in_browser
 @pytest.mark.parametrize(
     "effects",
-    [BARE, {"motion": "cosines", "rotation": None, "view_dependence": 3}, {"opacity_over_time": 2}],
-    ids=["at rest", "cosines", "opacity"],
+    [
+        BARE,
+        {"motion": "cosines", "rotation": None, "view_dependence": 3},
+        {"opacity_over_time": 2},
+        {"numbers": {"bodies": 0.5}},
+    ],
+    ids=["at rest", "cosines", "opacity", "quaternions"],
 )
 def test_scenes_of_other_effects_are_drawn_too(opened, effects):
     data = small_data()

@@ -1,16 +1,18 @@
 """What moves in a film begins at the distance of the ground that it stands on."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 import torch
 
 from forewarp.methods.method import Start
+from forewarp.methods.particles.bodies import Poses
 from forewarp.methods.particles.contact import set_down, things_on_the_ground
 from forewarp.methods.particles.model import Particles
-from forewarp.ops.gaussians import FLAT
+from forewarp.ops.gaussians import FLAT, moved
 from forewarp.scene.frame import where_seen
-from tests.support.particles import BARE, MOVING, module_with, small_data
+from tests.support.particles import BARE, MOVING, look, module_with, small_data
 
 DATA = small_data()
 FRAME = min(DATA.scene.train, key=lambda frame: abs(frame.time - DATA.scene.canonical_time))
@@ -53,9 +55,15 @@ def test_each_thing_stands_on_the_ground_below_it_unless_it_reaches_the_lower_ed
     assert things_on_the_ground(moving, depth) == []  # no ground is known
 
 
-@pytest.mark.parametrize("light", [None, torch.tensor([[0.5] * 3, [0.1] * 3])])
-def test_particles_of_what_moves_are_replaced_at_the_distance_of_the_ground(before, monkeypatch, light):
+@pytest.mark.parametrize(
+    ("light", "small"), [(None, 0.11), (torch.tensor([[0.5] * 3, [0.1] * 3]), 0.13)], ids=["large", "light"]
+)
+def test_particles_of_what_moves_are_replaced_at_the_distance_of_the_ground(
+    before, monkeypatch, light, small
+):
+    """It is a body only if all that moves, here 12 % of the image, is small."""
     method, away = before
+    monkeypatch.setattr("forewarp.methods.particles.contact._SMALL", small)
     monkeypatch.setattr(method, "light", lambda moment: light)
     mask = masked((6, 12, 6, 14))
     monkeypatch.setattr(
@@ -63,12 +71,15 @@ def test_particles_of_what_moves_are_replaced_at_the_distance_of_the_ground(befo
     )
     old = {name: p.data.clone() for name, p in method.named_parameters(recurse=False)}
     new = set_down(old, method, scene_with(mask))
-    moves = new.pop("set_down")
+    moves, body_of = new.pop("set_down"), new.pop("body_of")
+    assert torch.equal(body_of, torch.where(moves & (small > 0.12), 0, -1))
     assert new.keys() == old.keys()
     assert {len(value) for value in new.values()} == {len(moves)}
     distances = (new["means"] - FRAME.camera.center.float()).norm(dim=-1)
-    torch.testing.assert_close(distances[moves], torch.full((int(moves.sum()),), away))
     row, column, _ = where_seen(FRAME.camera, new["means"])
+    inside = torch.stack([row - 5, 12 - row, column - 5, 14 - column]).amin(0)[moves]  # pixels to the edge
+    bulge = (9 - (3 - inside) ** 2).sqrt() / FRAME.camera.fx
+    torch.testing.assert_close(distances[moves], away * (1 - bulge))
     assert bool(mask[row, column][moves].all())
     left = mask[row.clamp(0, SIZE[0] - 1), column.clamp(0, SIZE[1] - 1)] & ~moves
     assert bool((distances[left] > 0.99 * away).all())  # nothing is left before it
@@ -103,12 +114,14 @@ def test_without_masks_or_known_ground_or_with_measured_depth_nothing_changes(be
 
 
 @pytest.mark.parametrize("trusts", [True, False])
-def test_what_was_set_down_follows_nodes(before, trusts):
+def test_what_was_set_down_follows_nodes(before, monkeypatch, trusts):
     """Masks count only where the stage trusts them; what they show to move never rests."""
+    monkeypatch.setattr("forewarp.methods.particles.nodes._FEWEST", 1)  # a few particles are a body
+    monkeypatch.setattr("forewarp.methods.particles.contact._SMALL", 0.2)
     method, _ = before
     rests = torch.ones(SIZE, dtype=torch.bool)
     scene = scene_with(masked((6, 12, 6, 14)), load_resting=lambda: rests)
-    numbers = {"rest_by_masks": trusts}
+    numbers = {"rest_by_masks": trusts, "bodies": 0.5}
     start = Start(scene, "fine", numbers, list(range(len(scene.train))), None, method, False)
     fine = Particles(start, **MOVING | {"background": 0.03})
     count = len(fine.means) - len(method.means)
@@ -117,9 +130,22 @@ def test_what_was_set_down_follows_nodes(before, trusts):
         assert len(fresh)
         assert not bool(fine.resting[fresh].any())
         assert bool((fine.skinning.shares[fresh].sum(-1) > 0.99).all())
+        assert len(fine.nodes.bodies) == 1
+        followed = fine.nodes.bodies.of_node[fine.skinning.links[fresh].long()]
+        assert bool((followed[fine.skinning.shares[fresh] > 0] == 0).all())
         assert bool(fine.resting.any())
+        # An export before the nodes take over has the motion of bodies too, and leaves them the lead.
+        bodies, slow = fine.nodes.bodies, torch.tensor([0.1, 0.0, 0.05])
+        for time in bodies.times:
+            bodies.put(time, Poses(torch.eye(3)[None], bodies.rest + time * slow), torch.ones(3))
+        for time in bodies.times:
+            exact, written = (moved(fine.means.data, form.warp(time))[0] for form in (fine, fine.moving()))
+            torch.testing.assert_close(written, exact, atol=2e-3, rtol=0.0)
+            torch.testing.assert_close(exact[fresh], fine.means.data[fresh] + time * slow)
+        assert fine.nodes.led
     else:
         assert count == 0
+        assert len(fine.nodes.bodies) == 0
 
 
 def test_a_checkpoint_is_loaded_without_a_look_at_masks(before):
@@ -130,3 +156,33 @@ def test_a_checkpoint_is_loaded_without_a_look_at_masks(before):
     scene = scene_with(None, load_moving=unread)
     start = Start(scene, "fine", {"rest_by_masks": True}, [0], None, method, True)
     assert len(Particles(start, **MOVING).means) == len(method.means)
+
+
+def test_bodies_lead_until_their_share_of_the_stage_is_over(before, monkeypatch):
+    """A step at an image follows them there, and is of their poses alone; nothing rests before it is over."""
+    monkeypatch.setattr("forewarp.methods.particles.nodes._FEWEST", 1)
+    monkeypatch.setattr("forewarp.methods.particles.contact._SMALL", 0.2)
+    rests = torch.ones(SIZE, dtype=torch.bool)
+    scene = scene_with(masked((6, 12, 6, 14)), load_resting=lambda: rests)
+    numbers = {"rest_by_masks": True, "bodies": 0.5}
+    start = Start(scene, "fine", numbers, list(range(len(scene.train))), None, before[0], False)
+    fine = Particles(start, **MOVING | {"background": 0.03})
+    groups = [{"name": n, "params": p, "lr": 1e-3, "base_lr": 1e-3} for n, p in fine.param_groups().items()]
+    optimizer, bodies = fine.optimizer(groups), fine.nodes.bodies
+    index = max(range(len(scene.train)), key=lambda i: abs(scene.train[i].time - scene.canonical_time))
+    time = scene.train[index].time
+    assert not bool(bodies.seen[bodies.row(time)])
+    found = look(
+        SimpleNamespace(method=fine, generator=torch.Generator()), DATA, index, {"photo": 1.0}
+    ).gradients
+    assert bool(bodies.seen[bodies.row(time)])
+    assert bool(found["nodes.bodies.twists"][:, bodies.row(time)].any())
+    assert not bool(found["nodes.translations"].any() | found["nodes.rotations"].any())
+    fine.round.fill_(44)
+    fine.advance(0.4501, 0, optimizer)
+    assert fine.nodes.led
+    assert not bool(fine.nodes.stopped.any())
+    assert not bool(fine.nodes.translations.any())
+    fine.advance(0.5, 0, optimizer)
+    assert not fine.nodes.led
+    assert bool(fine.nodes.translations.any())

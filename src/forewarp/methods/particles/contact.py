@@ -22,7 +22,8 @@ from forewarp.scene.view import Moment, View
 if TYPE_CHECKING:
     from forewarp.methods.particles.model import Particles
 
-_SMALLEST = 1e-3  # share of an image's pixels, below which a patch of a mask is no thing
+# Shares of an image's pixels: below which a patch of a mask is no thing; up to which all that moves is small.
+_SMALLEST, _SMALL = 1e-3, 0.1
 # Share of a thing's height, above its lowest row, within which columns end that touch the ground.
 _LOWEST = 0.2
 # Shares of an image's height: by which a look goes below a thing's lower edge; by which its mask is enlarged,
@@ -47,7 +48,9 @@ def set_down(values: dict[str, Tensor], before: Particles, scene: Scene) -> dict
 
     Returns:
         the values, without particles that stood in for these things, and with new ones last; ``set_down``,
-        bool of each, says which are new. Where nothing changes, the values as they are.
+        bool of each, says which are new, and ``body_of``, int64, which body each is of, -1: of none. Bodies
+        are things of films whose movers are small: what fills an image, as a hand, is mostly not rigid. Where
+        nothing changes, the values as they are.
 
     Cost: an image is rendered.
     """
@@ -66,9 +69,11 @@ def set_down(values: dict[str, Tensor], before: Particles, scene: Scene) -> dict
     row, column = row.clamp(0, height - 1), column.clamp(0, camera.width - 1)
     away, gone = (means - camera.center.float()).norm(dim=-1), torch.zeros(len(means), dtype=torch.bool)
     ground = torch.zeros_like(depth)  # of pixels on whose grid new particles lie
+    bulge, things = torch.zeros_like(depth), torch.full(depth.shape, -1)
     for thing, distance in things_on_the_ground(moving, depth):
         if bool(thing[::step, ::step].any()):
-            ground[thing] = distance
+            ground[thing], things[thing] = distance, int(things.max()) + 1
+            bulge[thing] = distance / camera.fx * _bulge(thing)[thing]
             beside = dilate(thing, edge) & ~moving
             gone |= visible & thing[row, column] & (away < _BEHIND * distance)
             gone |= visible & beside[row, column] & (away < _BESIDE * distance)
@@ -76,7 +81,7 @@ def set_down(values: dict[str, Tensor], before: Particles, scene: Scene) -> dict
         return values
     if "shared" in values:
         gone &= values["shared"] < 0
-    fresh, kept = _pieces(frame, ground, step, before.light(moment)), {}
+    fresh, kept = _pieces(frame, ground, bulge, step, before.light(moment)), {}
     count = len(fresh["means"])
     for name, value in values.items():
         if name == "exposure":
@@ -84,6 +89,10 @@ def set_down(values: dict[str, Tensor], before: Particles, scene: Scene) -> dict
         else:
             empty = value.new_full((count, *value.shape[1:]), -1 if name == "shared" else 0)
             kept[name] = torch.cat([value[~gone], fresh.get(name, empty)])
+    of = things[::step, ::step][ground[::step, ::step] > 0]
+    if float(moving.float().mean()) > _SMALL:
+        of = torch.full_like(of, -1)
+    kept["body_of"] = torch.cat([torch.full((len(kept["means"]) - count,), -1), of])
     kept["set_down"] = torch.arange(len(kept["means"])) >= len(kept["means"]) - count
     return kept
 
@@ -99,15 +108,12 @@ def things_on_the_ground(moving: Tensor, depth: Tensor) -> list[tuple[Tensor, fl
         masks (H, W) bool, and distances; nothing of what reaches the lower edge of the image, or stands
         mostly on what is not known.
     """
-    from scipy.ndimage import label  # late, as its import takes time
-
-    height, labels, found = len(depth), torch.from_numpy(label(moving.numpy(), torch.ones(3, 3))[0]), []
-    counts, below = labels.flatten().bincount(), max(1, round(_BELOW * height))
-    for number in (counts >= _SMALLEST * labels.numel()).nonzero()[:, 0].tolist():
-        thing = labels == number
+    height, found = len(depth), []
+    below = max(1, round(_BELOW * height))
+    for thing in patches_of(moving):
         rows = thing.any(1).nonzero()[:, 0]
         top, bottom = int(rows[0]), int(rows[-1])
-        if number == 0 or bottom + below >= height:
+        if bottom + below >= height:
             continue
         lowest = torch.where(thing, torch.arange(height)[:, None], -1).amax(0)  # of each column
         columns = (lowest >= bottom - _LOWEST * (bottom - top)).nonzero()[:, 0]
@@ -119,9 +125,32 @@ def things_on_the_ground(moving: Tensor, depth: Tensor) -> list[tuple[Tensor, fl
     return found
 
 
-def _pieces(frame: Frame, ground: Tensor, step: int, light: Tensor | None) -> dict[str, Tensor]:
-    """Make particles at the distances (H, W), not 0, of every ``step``-th pixel, coloured like an image
-    without its ``light``.
+def patches_of(moving: Tensor) -> list[Tensor]:
+    """Tell the patches of a mask (H, W) bool apart: a mask of each that is not tiny."""
+    from scipy.ndimage import label  # late, as its import takes time
+
+    labels = torch.from_numpy(label(moving.numpy(), torch.ones(3, 3))[0])
+    large = labels.flatten().bincount() >= _SMALLEST * labels.numel()
+    return [labels == number for number in large.nonzero()[:, 0].tolist() if number]
+
+
+def _bulge(thing: Tensor) -> Tensor:
+    """Return how far the middle of a thing (H, W) bool stands out before its edge, pixels: as of a ball.
+
+    Of what is flat, an image does not tell which way it turns; what is solid bulges towards the camera.
+    """
+    from scipy.ndimage import distance_transform_edt  # late, as above
+
+    inside = torch.from_numpy(distance_transform_edt(thing.numpy())).float()
+    radius = float(inside.amax())
+    return (radius**2 - (radius - inside) ** 2).sqrt()
+
+
+def _pieces(
+    frame: Frame, ground: Tensor, bulge: Tensor, step: int, light: Tensor | None
+) -> dict[str, Tensor]:
+    """Make particles at the distances (H, W), not 0, of every ``step``-th pixel, less the ``bulge`` (H, W),
+    coloured like an image without its ``light``.
     """
     camera = frame.camera
     rows, columns = (step * ground[::step, ::step].nonzero()).unbind(-1)
@@ -131,6 +160,7 @@ def _pieces(frame: Frame, ground: Tensor, step: int, light: Tensor | None) -> di
         gain, bias = light.cpu()
         colors = (colors - bias) / gain
     spacing = step * distance / camera.fx
+    distance = distance - bulge[rows, columns]
     cloud = Cloud(
         rays.origins + distance[:, None] * rays.directions, colors, distance, float(spacing.median())
     )

@@ -60,7 +60,8 @@ def control(particles: Particles, progress: float, optimizer: torch.optim.Optimi
         particles.skinning.relink(particles.nodes, particles.means.data, optimizer)
         if (still := left_alone(particles.shared, particles.resting)) is not None:
             particles.skinning.release(still)
-        if particles.least_motion is not None and progress >= stage.rest_from:
+        rests = particles.least_motion is not None and progress >= stage.rest_from
+        if rests and not particles.nodes.led:  # curves say where nodes go
             least = max(particles.least_motion, pixel_width(float(particles.covered_pixels)))
             come_to_rest(particles, least * float(particles.extent))
 

@@ -17,12 +17,13 @@ from forewarp.losses import IMAGE_LOSSES, robust
 from forewarp.methods.method import Method, Snapshot, Start, Step, value_at
 from forewarp.methods.particles import density, exposure
 from forewarp.methods.particles.contact import set_down
+from forewarp.methods.particles.follow import follow
 from forewarp.methods.particles.nodes import Nodes, Skinning, TimeOffsets, are_rows
 from forewarp.methods.particles.options import EFFECTS, SMALLEST, Effects, Numbers, view_share
 from forewarp.methods.particles.shared import begin_window, check_still, left_alone
 from forewarp.methods.particles.start import at_rest, compile_kernels, first_values, fresh_values
 from forewarp.methods.rows import RowsAdam, keep_rows
-from forewarp.ops.gaussians import BLUR, CHUNK, DEEP, Gaussians, Warp, compare, moved
+from forewarp.ops.gaussians import BLUR, CHUNK, DEEP, Gaussians, ImageLoss, Warp, compare, moved
 from forewarp.ops.nodes import pull_nodes
 from forewarp.scene.box import Box
 from forewarp.scene.camera import Camera
@@ -95,6 +96,7 @@ class Particles(Method):
         # Whether a step's images come with planes beside their colours, which the kernels are compiled for.
         self.has_planes = any(f.load_valid or (self.asks.sensed and f.load_sensed) for f in train)
         self.views = len(train)
+        self.masks = {frame.time: frame.load_moving for frame in train}
         effects = Effects(**choices).only(self.stage.effects, len(times))
         self.ends = min(times), max(times)
         self.progress = self.decay = self.hidden_decay = 0.0
@@ -103,7 +105,8 @@ class Particles(Method):
 
         self.box = start.scene.box if self.stage.shell and not start.scene.has_alpha else None
         values = self._first_values(start, effects.motion is not None and self.stage.rest_by_masks)
-        new, count = values.pop("set_down", None), len(values["means"])
+        new, body_of = values.pop("set_down", None), values.pop("body_of", None)
+        count = len(values["means"])
         self.means = nn.Parameter(values["means"])
         self.scales = nn.Parameter(values["scales"])  # logarithms
         self.quaternions = nn.Parameter(values["quaternions"])  # w, x, y, z of any length
@@ -146,7 +149,13 @@ class Particles(Method):
                 offsets = TimeOffsets(times, self.stage.time_offsets)
             points, edges = None if start.blank else own, self.stage.edges
             rotates, rests = effects.rotation is not None, effects.background is not None
-            self.nodes = Nodes(points, nodes, curve, offsets, rotates=rotates, rests=rests, edges=edges)
+            if self.stage.bodies == 0 or not rotates:
+                body_of = None
+            else:
+                body_of = torch.full((len(self.means),), -1) if body_of is None else body_of
+                body_of = body_of if len(own) == len(body_of) else body_of[~still]
+            more = {"rotates": rotates, "rests": rests, "edges": edges, "body_of": body_of, "times": times}
+            self.nodes = Nodes(points, nodes, curve, offsets, **more)
             self.skinning = Skinning(self.nodes, self.means.data)
             if still is not None:
                 self.skinning.release(still)
@@ -274,6 +283,8 @@ class Particles(Method):
         terms, gradients = dict.fromkeys(self.terms, 0.0), {}
         squared, numbers, views, has_depth = 0.0, 0, len(batch.observations), False
         for whole in batch.observations:
+            if self.nodes is not None and self.nodes.led:
+                follow(self, whole, self.masks[whole.moment.time])
             seen = self._smaller(whole)
             covered = float(self.covered_pixels) * len(seen.view) / len(whole.view)
             squared_error, of_image, found = self._compare(seen, factors, generator, views, covered)
@@ -326,19 +337,17 @@ class Particles(Method):
             motion_time = nodes.motion_time(time)
             nodes.extend(motion_time)
             basis = nodes.summed_basis((motion_time, 1.0))
-            motion, maps = nodes.motion_and_maps(basis)
+            motion, maps = nodes.carried(time, basis)
             warp = Warp(maps, self.skinning.links, self.skinning.weights())
         colors, light, terms = self._color_parameters(), self.light(seen.moment), {}
         loss = self._image_loss(factors, terms)
         of_colors = factors.get("photo", 0.0) if loss is None else 1.0
         sensed = seen.sensed if "depth" in factors else None
-        compared = compare(
-            self.gaussians(light), warp, pinhole_of(seen.view.camera, self.blur), *self.time_bases(time),
-            seen.rgb, seen.background, width=self.width, factor=of_colors / (covered * views),
-            by_skin=self.moves, kinds=[getattr(self, name).shape[1] for name in colors], loss=loss,
-            valid=seen.valid, sensed=sensed, by_depth=factors.get("depth", 0.0) / of_colors, deep=self.deep,
-            chunk=self.chunk,
-        )  # fmt: skip
+        by_depth = factors.get("depth", 0.0) / of_colors
+        more = {"loss": loss, "sensed": sensed, "by_depth": by_depth}
+        compared = self.compared(
+            seen, self.gaussians(light), warp, time, of_colors / (covered * views), **more
+        )
         terms = {"depth": compared.depth} | (terms or {"photo": compared.loss})
         terms = {name: value / covered for name, value in terms.items()}
         by_place = compared.pixel_gradient
@@ -366,12 +375,26 @@ class Particles(Method):
             if "static" in factors:
                 to_rest, terms["static"] = nodes.pull_to_rest(motion, factors["static"], extent)
                 by_motion = by_motion + to_rest
+            if nodes.led:
+                gradients["nodes.bodies.twists"] = nodes.bodies.gradients(time, compared.maps)
             terms["smooth"], of_nodes = nodes.backward(time, motion_time, basis, by_motion, smooth, extent)
             gradients |= {"skinning.logits": compared.skin, **of_nodes}
         if self.shared is not None:
             for name in gradients.keys() & {*self.grows}:
                 gradients[name][self.shared >= 0] = 0.0  # the optimiser passes over them
         return compared.squared, terms, gradients
+
+    def compared(
+        self, seen: Observation, particles: Gaussians, warp: Warp, time: float, factor: float, *,
+        loss: Callable | None = None, sensed: Tensor | None = None, by_depth: float = 0.0,
+    ) -> ImageLoss:  # fmt: skip
+        """Compare particles, moved by a warp, with an image; see ``ops.gaussians.compare``."""
+        return compare(
+            particles, warp, pinhole_of(seen.view.camera, self.blur), *self.time_bases(time),
+            seen.rgb, seen.background, width=self.width, factor=factor, by_skin=self.moves,
+            kinds=[getattr(self, name).shape[1] for name in self._color_parameters()], loss=loss,
+            valid=seen.valid, sensed=sensed, by_depth=by_depth, deep=self.deep, chunk=self.chunk,
+        )  # fmt: skip
 
     def _image_loss(self, factors: Mapping[str, float], terms: dict[str, float]) -> Callable | None:
         """Return the weighted sum of all losses of an image, which notes each in ``terms``; None if ``photo``
@@ -392,7 +415,7 @@ class Particles(Method):
     def _jittered(self, time: float, generator: torch.Generator) -> float:
         """Shift an image's time at random, less and less, so that curves do not follow single images."""
         deviation = self.stage.jitter * max(0.0, 1 - self.progress / self.stage.jitter_until)
-        if self.nodes is None or deviation == 0:
+        if self.nodes is None or self.nodes.led or deviation == 0:
             return time
         return min(1.0, max(0.0, time + deviation * float(torch.randn((), generator=generator))))
 
@@ -403,9 +426,11 @@ class Particles(Method):
         decays of opacity the rate of opacity.
         """
         self.progress, stage = progress, self.stage
+        if self.nodes is not None and self.nodes.led and progress >= stage.bodies:
+            self.nodes.bodies.hand_over(self.nodes)
         density.bound_opacity(self)
         for group in optimizer.param_groups:
-            if group["name"] in ("means", "node_translations"):
+            if group["name"] in ("means", "node_translations", "node_bodies"):
                 group["lr"] *= float(self.extent)
             elif group["name"] == "time_offsets":
                 self.nodes.time_offsets.learns = progress >= stage.jitter_until
@@ -439,6 +464,8 @@ class Particles(Method):
         """Make an Adam that passes over unseen rows; after a step, let the opacity of what was seen decay."""
         optimizer = RowsAdam(groups)
         optimizer.register_step_post_hook(lambda *_: density.decay_opacity(self))
+        if self.nodes is not None and self.nodes.bodies is not None:
+            optimizer.register_step_post_hook(lambda *_: self.nodes.bodies.settle())
         return optimizer
 
     def protocol(self) -> dict[str, str]:
@@ -456,6 +483,9 @@ class Particles(Method):
         """See ``HasMovingGaussians``: all particles, in their order."""
         motion, nodes = None, self.nodes
         if nodes is not None:
+            if nodes.led:
+                nodes = copy.deepcopy(nodes)
+                nodes.bodies.hand_over(nodes)
             offsets = nodes.time_offsets
             times = [] if offsets is None else offsets.times
             curves = nodes.translations.data, _data(nodes.rotations), nodes.curve

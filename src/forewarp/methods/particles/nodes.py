@@ -9,6 +9,7 @@ from torch import Tensor, nn
 
 from forewarp.fields.curves import Curve
 from forewarp.fields.moving import around
+from forewarp.methods.particles.bodies import Bodies
 from forewarp.ops.nodes import carry_nodes, skin_weights, spread_nodes
 from forewarp.scene.cloud import far_apart, nearest
 
@@ -21,6 +22,7 @@ _FARTHEST = 0.2  # of all time: no image's time is off by more
 _BEYOND = _FARTHEST + 2 * _HALF_STEP  # of all time, by which a curve must reach beyond [0, 1]
 _REST = 3e-3  # share of a unit below which nodes are pulled to rest with less than full force
 _REST_TIMES = 16  # over which a node's mean place is taken
+_FEWEST = 20  # nodes of a body
 _PULL = 0.1  # of the learning rate: by how much a step draws an offset towards 0
 
 
@@ -71,7 +73,8 @@ class Nodes(nn.Module):
     """M nodes at rest ``positions`` (M, 3), each with a curve of translations and of rotations over time.
 
     Parameters are the curves' coefficients (M, K, 3): ``translations`` in world units, and ``rotations`` as
-    Gibbs vectors, None where nodes do not rotate.
+    Gibbs vectors, None where nodes do not rotate; with ``bodies`` as quaternions (M, K, 4), see
+    ``ops.nodes.node_maps``.
 
     Args:
         points: (N, 3) canonical points that are to move; None: a checkpoint will say.
@@ -81,6 +84,9 @@ class Nodes(nn.Module):
         rotates: whether nodes rotate.
         rests: whether nodes may ``stop``; ``stopped`` (M,) bool says which have.
         edges: neighbours that a node is kept rigid with.
+        body_of: (N,) int64, the body that each of ``points`` is of, -1: of none; None: there are no
+            ``bodies``. Nodes, links and edges are of one body each, or of none.
+        times: of training images, for poses of bodies.
     """
 
     loose = ("edges", "edge_weights")  # few nodes have few neighbours
@@ -95,19 +101,32 @@ class Nodes(nn.Module):
         rotates: bool = True,
         rests: bool = False,
         edges: int = 6,
+        body_of: Tensor | None = None,
+        times: Sequence[float] = (),
     ) -> None:
         super().__init__()
         self.curve, self.time_offsets = curve, time_offsets
-        positions = torch.zeros(1, 3) if points is None else points[far_apart(points, count)].clone()
-        count = len(positions)
+        rows, positions = None, torch.zeros(1, 3)
+        if points is not None:
+            rows = far_apart(points, count) if body_of is None else _of_each(body_of, points, count)
+            positions = points[rows].clone()
+            if body_of is not None:
+                body_of = _large(body_of, rows)
+        count, self.bodies = len(positions), None
+        if body_of is not None:
+            of_node = torch.full((1,), -1) if rows is None else body_of[rows]
+            self.bodies = Bodies(of_node, positions, times, curve.canonical_time)
         squared, neighbours = nearest(positions, positions, edges + 1)
         squared, neighbours = squared[:, 1:], neighbours[:, 1:]  # the nearest is the node itself
         unit = squared.mean() if squared.numel() else torch.tensor(1.0)
         padded = squared + 1e-3 * unit
         stiffness = (padded > _LEAST) / padded.clamp(min=_LEAST)
+        if self.bodies is not None:
+            stiffness = stiffness * (of_node[neighbours] == of_node[:, None])
         spacing = squared[:, :3].sqrt().mean(-1) if squared.shape[1] else torch.ones(count)
         self.translations = nn.Parameter(torch.zeros(count, curve.count, 3))
-        self.rotations = nn.Parameter(torch.zeros(count, curve.count, 3)) if rotates else None
+        numbers = 3 if self.bodies is None else 4
+        self.rotations = nn.Parameter(torch.zeros(count, curve.count, numbers)) if rotates else None
         self.register_buffer("positions", positions)
         self.register_buffer("edges", neighbours.contiguous())
         self.register_buffer("edge_weights", stiffness / max(neighbours.numel(), 1))
@@ -117,6 +136,12 @@ class Nodes(nn.Module):
         self.register_buffer("seen_times", torch.tensor([curve.canonical_time] * 2))  # from, to
         names = ("positions", "edges", "edge_weights", "spacing", "stopped", "translations", "rotations")
         self.grows = tuple(name for name in names if getattr(self, name) is not None)
+        self.grows += () if self.bodies is None else ("bodies.of_node",)
+
+    @property
+    def led(self) -> bool:
+        """Whether bodies lead their nodes, and nothing else moves."""
+        return self.bodies is not None and bool(self.bodies.lead)
 
     def links(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """Return the nodes that points (N, 3) follow: rows (N, L) int32, and their shares (N, L).
@@ -125,6 +150,9 @@ class Nodes(nn.Module):
         """
         squared, rows = nearest(points, self.positions, LINKS)
         shares = torch.exp(-(squared - squared[:, :1]) / (2 * self.spacing[rows] ** 2))
+        if self.bodies is not None:
+            of = self.bodies.of_node[rows]
+            shares = shares * (of == of[:, :1])
         return rows.int(), (shares / shares.sum(-1, keepdim=True)).contiguous()
 
     def motion_time(self, time: float) -> float:
@@ -140,16 +168,24 @@ class Nodes(nn.Module):
         return self.curve.summed(parts, 0.0 if self.time_offsets is None else _BEYOND).to(self.positions)
 
     def motion_and_maps(self, basis: Tensor) -> tuple[Tensor, Tensor]:
-        """Return translations and rotations (M, 6) for a curve's basis (K,), and the nodes' maps (M, 12)."""
+        """Return the motion (M, 6 or 7) for a curve's basis (K,), and the nodes' maps (M, 12)."""
         return carry_nodes(self.translations, self.rotations, basis, self.positions)
+
+    def carried(self, time: float, basis: Tensor) -> tuple[Tensor, Tensor]:
+        """Return ``motion_and_maps`` at a given time with this basis; by bodies, while they lead."""
+        motion, maps = self.motion_and_maps(basis)
+        if self.led:
+            self.bodies.carry(self.bodies.at(time), self.positions, motion, maps)
+        return motion, maps
 
     def maps(self, time: float) -> Tensor:
         """Return the nodes' maps (M, 12) at a given time; see ``ops.nodes.node_maps``."""
-        return self.motion_and_maps(self.basis(time))[1]
+        return self.carried(time, self.basis(time))[1]
 
     def param_groups(self) -> dict[str, list[nn.Parameter]]:
         """Return what is learned, by the name of its learning rate."""
         groups = {"node_translations": [self.translations], "node_rotations": self._coefficients()[1:]}
+        groups["node_bodies"] = [] if self.bodies is None else [self.bodies.twists]
         groups["time_offsets"] = [] if self.time_offsets is None else [self.time_offsets.values]
         return {name: group for name, group in groups.items() if group}
 
@@ -191,7 +227,8 @@ class Nodes(nn.Module):
     def _arms(self) -> tuple[float, Tensor]:
         """Return the factors by which translations, and rotations (M,), become distances.
 
-        A Gibbs vector is half the angle, and what rotates lies about ``spacing`` from the node.
+        A Gibbs vector, and the first three numbers of a quaternion, is half a small angle; what rotates lies
+        about ``spacing`` from the node.
         """
         return 1.0, 2 * self.spacing
 
@@ -227,7 +264,7 @@ class Nodes(nn.Module):
         Args:
             time, motion_time: given time of an image, and the time of the motion that it shows.
             basis: the curve's (K,) at ``motion_time``.
-            by_motion: gradients (M, 6) by the motion of nodes.
+            by_motion: gradients (M, 6 or 7) by the motion of nodes.
             factor: weight of the second differences.
             unit: a length, world units.
 
@@ -237,6 +274,9 @@ class Nodes(nn.Module):
         bend = self._second_difference(motion_time) if factor else torch.zeros_like(basis)
         coefficients = self.translations, self.rotations
         *gradients, bent = spread_nodes(*coefficients, by_motion, basis, bend, factor, unit)
+        if self.led:
+            for gradient in gradients:
+                gradient.zero_()  # nothing else moves
         if self.stopped is not None and bool(self.stopped.any()):
             for gradient in gradients:
                 if gradient is not None:
@@ -259,15 +299,15 @@ class Nodes(nn.Module):
         turning from the mean takes what is beside it, over ``unit``. The mean counts as constant.
 
         Args:
-            motion: (M, 6) at a time, of ``motion_and_maps``.
+            motion: (M, 6 or 7) at a time, of ``motion_and_maps``.
             factor: weight.
             unit: a length, world units.
 
         Returns:
-            gradients (M, 6) by ``motion``; and the sum of both means.
+            gradients, of the shape of ``motion``; and the sum of both means.
         """
         gradients, value, mean = torch.zeros_like(motion), 0.0, self._mean_basis().to(motion)
-        for coefficients, arm, part in zip(self._coefficients(), self._arms(), (slice(3), slice(3, 6))):
+        for coefficients, arm, part in zip(self._coefficients(), self._arms(), (slice(3), slice(3, 7))):
             by_unit = torch.as_tensor(arm, device=motion.device).reshape(-1, 1) / unit
             away = by_unit * (motion[:, part] - torch.einsum("mkc,k->mc", coefficients, mean))
             size = (away.square().sum(-1, keepdim=True) + _REST**2).sqrt()
@@ -292,6 +332,24 @@ class Nodes(nn.Module):
         middle = min(max(motion_time, low), high)
         before, after = max(middle - step, 0.0), min(middle + step, 1.0)
         return self.summed_basis((after, 1.0), (middle, -2.0), (before, 1.0))
+
+
+def _large(body_of: Tensor, rows: Tensor) -> Tensor:
+    """Let only those be bodies, numbered anew, that have as many nodes as say where they are."""
+    made, count = torch.full_like(body_of, -1), 0
+    for body in body_of.unique().tolist():
+        if body >= 0 and int((body_of[rows] == body).sum()) >= _FEWEST:
+            made[body_of == body], count = count, count + 1
+    return made
+
+
+def _of_each(body_of: Tensor, points: Tensor, count: int) -> Tensor:
+    """Choose about ``count`` rows of points (N, 3) that are far apart: of each body by its share of them."""
+    rows = []
+    for body in body_of.unique().tolist():
+        own = (body_of == body).nonzero()[:, 0]
+        rows.append(own[far_apart(points[own], max(4, round(count * len(own) / len(points))))])
+    return torch.cat(rows)
 
 
 def are_rows(indices: Tensor, count: int) -> bool:

@@ -104,6 +104,8 @@ class Numbers:
             below 96 pixels of the longer side: motion over many pixels is found in cheap steps.
         rest_by_masks: whether particles follow no node that rest in the whole film by masks of its images, if
             it has any and most of an image rests.
+        bodies: share of the stage up to which what one camera sees on the ground (by ``rest_by_masks``) moves
+            as rigid bodies, and nothing else moves; nodes must rotate. 0: nothing does.
         shell: far planes of the cameras at which particles stand behind all that images show; what is outside
             the box is at rest; at least 1. 0: particles begin in the box, and all may move. Images with alpha
             have none.
@@ -134,6 +136,7 @@ class Numbers:
     rigid_final_factor: float = 0.17
     image_scale: Sequence[Sequence[float]] = ((0.0, 1),)
     rest_by_masks: bool = False
+    bodies: float = 0.0
     shell: float = 0.0
     name: str = "fine"
 
@@ -144,7 +147,7 @@ class Numbers:
         for key in ("natural_splines", "rest_by_masks"):
             check_value(f"{where}.{key}", getattr(self, key), "true or false", lambda v: isinstance(v, bool))
         shares = "initial_share", "final_share", "density_interval", "rigid_final_factor"
-        decays = "opacity_decay", "crowd_decay", "hidden_decay"
+        decays = "opacity_decay", "crowd_decay", "hidden_decay", "bodies"
         others = "density_until", "rest_from", "jitter", "time_offsets"
         for keys, wanted, good in (
             (shares, "a number in (0, 1]", lambda value: 0 < value <= 1),

@@ -1,0 +1,224 @@
+"""Bodies: poses at times, gradients by turns and shifts, curves that take over, images that show them."""
+
+import pytest
+import torch
+
+from forewarp.fields.curves import Curve
+from forewarp.methods.particles.bodies import Poses
+from forewarp.methods.particles.follow import Look, Sight, find, near_places, onto_patch
+from forewarp.methods.particles.nodes import Nodes
+from forewarp.ops.nodes import node_maps
+from forewarp.scene.camera import Camera
+
+AXIS = torch.linspace(-0.3, 0.3, 4)
+CUBE = torch.cartesian_prod(AXIS, AXIS, AXIS)
+TIMES = [i / 20 for i in range(21)]
+EYE = torch.tensor([0.0, 0.0, 10.0])
+IDENTITY = torch.tensor([0.0, 0.0, 0.0, 1.0])
+
+
+def rotation(*vector):
+    x, y, z = vector
+    return torch.matrix_exp(torch.tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]]))
+
+
+@pytest.fixture
+def nodes():
+    """Two cubes, two apart, and between them points of no body."""
+    points = torch.cat([CUBE - torch.tensor([1.0, 0.0, 0.0]), CUBE + torch.tensor([1.0, 0.0, 0.0]), CUBE[:8]])
+    body_of = torch.tensor([0] * 64 + [1] * 64 + [-1] * 8)
+    return Nodes(points, 60, Curve("spline", 9, 21, 0.5), body_of=body_of, times=TIMES)
+
+
+def rolled(nodes, time, slow=1.0):
+    """Poses of bodies that roll evenly, the first by more than half a turn in all."""
+    far = slow * (time - 0.5)
+    turns = torch.stack([rotation(0.0, 0.0, 7.0 * far), rotation(far, 0.0, 0.0)])
+    return Poses(turns, nodes.bodies.rest + far * torch.tensor([[0.5, 1.0, 0.0], [0.0, 0.0, 2.0]]))
+
+
+def seen(nodes, *times, slow=1.0):
+    for time in times:
+        nodes.bodies.put(time, rolled(nodes, time, slow), EYE)
+
+
+@torch.no_grad()
+def places(nodes, time):
+    motion = nodes.carried(time, nodes.basis(time))[0]
+    return nodes.positions + motion[:, :3]
+
+
+def apart(nodes, poses, others):
+    return nodes.bodies.apart(poses, others).abs().amax()
+
+
+def shown(nodes, truth, time):
+    """An image whose loss is how far nodes are from those of the truth, as a camera at ``EYE`` sees them."""
+    truth_maps = node_maps_of(nodes, truth)
+
+    def compare(maps):
+        maps = maps.clone().requires_grad_()
+        with torch.enable_grad():
+            linear = (maps - truth_maps)[:, :9].reshape(-1, 3, 3)
+            off = (linear @ nodes.positions[..., None])[..., 0] + (maps - truth_maps)[:, 9:]
+            loss = off.square().sum()
+            return torch.autograd.grad(loss, maps)[0], float(loss.detach())
+
+    return Sight(EYE, lambda places: [Look(compare, 200.0)] * 3)
+
+
+def node_maps_of(nodes, poses):
+    maps = torch.zeros(len(nodes.positions), 12)
+    nodes.bodies.carry(poses, nodes.positions, torch.zeros(len(maps), 7), maps)
+    return maps
+
+
+def camera_at(width, height):
+    return Camera(width, height, 50.0, 50.0, width / 2, height / 2, torch.eye(4), 0.1, 10.0)
+
+
+def test_nodes_links_and_edges_are_of_one_body_each(nodes):
+    of_node = nodes.bodies.of_node
+    assert [int((of_node == body).sum()) for body in (0, 1, -1)] == [28, 28, 4]
+    ends = nodes.edges[nodes.edge_weights > 0]
+    starts = torch.arange(len(of_node))[:, None].expand_as(nodes.edges)[nodes.edge_weights > 0]
+    assert torch.equal(of_node[ends], of_node[starts])
+    rows, shares = nodes.links(torch.tensor([[0.52, 0.0, 0.0], [-0.75, 0.0, 0.0]]))
+    for row, share, body in zip(rows.long(), shares, (1, 0)):
+        assert {*of_node[row[share > 0]].tolist()} == {body}
+    torch.testing.assert_close(shares.sum(-1), torch.ones(2))
+
+
+def test_nodes_go_with_their_bodies_and_others_rest(nodes):
+    seen(nodes, 0.75)
+    poses, of_node = rolled(nodes, 0.75), nodes.bodies.of_node
+    now = places(nodes, 0.75)
+    for body in (0, 1):
+        own = nodes.positions[of_node == body] - nodes.bodies.rest[body]
+        torch.testing.assert_close(
+            now[of_node == body], own @ poses.turns[body].T + poses.middles[body], atol=1e-5, rtol=0.0
+        )
+    assert torch.equal(now[of_node < 0], nodes.positions[of_node < 0])
+    with torch.no_grad():
+        motion, maps = nodes.carried(0.75, nodes.basis(0.75))
+    torch.testing.assert_close(node_maps(motion, nodes.positions), maps, atol=1e-5, rtol=1e-5)
+
+
+def test_poses_lie_between_those_seen_and_stay_beyond_them(nodes):
+    seen(nodes, 0.75)
+    assert apart(nodes, nodes.bodies.at(0.6), rolled(nodes, 0.6)) < 1e-5
+    for time, end in ((0.9, 0.75), (0.1, 0.5)):
+        assert apart(nodes, nodes.bodies.at(time), rolled(nodes, end)) < 1e-5
+
+
+def test_gradients_are_those_of_poses_that_take_a_small_twist_over(nodes):
+    seen(nodes, 0.8)
+    factors = torch.randn(len(nodes.positions), 12, generator=torch.Generator().manual_seed(1))
+    bodies, row = nodes.bodies, nodes.bodies.row(0.8)
+    found = bodies.gradients(0.8, factors)
+    others = torch.arange(len(TIMES)) != row
+    assert not bool(found[:, others].any())
+    start, small = (bodies.turns.clone(), bodies.middles.clone()), 1e-3
+    for body in range(2):
+        for number in range(6):
+            sides = []
+            for sign in (1, -1):
+                bodies.turns, bodies.middles = (value.clone() for value in start)
+                bodies.twists.data[body, row, number] = sign * small
+                bodies.settle()
+                assert not bool(bodies.twists.any())
+                sides.append(float((node_maps_of(nodes, bodies.at(0.8)).double() * factors).sum()))
+            exact = (sides[0] - sides[1]) / (2 * small)
+            assert float(found[body, row, number]) == pytest.approx(exact, rel=0.01, abs=0.05)
+
+
+def test_bodies_stay_before_what_is_behind_them(nodes):
+    bodies, poses = nodes.bodies, rolled(nodes, 0.6)
+    away = (poses.middles - EYE).norm(dim=-1)
+    bodies.put(0.6, poses, EYE)
+    bodies.bring_before(0.6, torch.stack([0.99 * away[0], 0.5 * away[1]]))
+    nearer = (bodies.at(0.6).middles - EYE).norm(dim=-1) / away
+    torch.testing.assert_close(nearer, torch.tensor([0.99, 0.97]))  # the other would have jumped
+    bodies.twists.data[0, bodies.row(0.6), 3:] = 0.2 * (poses.middles[0] - EYE)
+    bodies.settle()
+    assert float((bodies.at(0.6).middles[0] - EYE).norm() / away[0]) == pytest.approx(0.99, rel=1e-4)
+
+
+@pytest.mark.parametrize("kind", ["spline", "cosines"])
+def test_curves_take_over_where_bodies_are(nodes, kind):
+    """Cosines are exactly 0 at the canonical time, before which the first turns by more than half a turn."""
+    nodes.curve = Curve(kind, 18, 21, 0.5)
+    nodes.translations.data, nodes.rotations.data = torch.zeros(60, 18, 3), torch.zeros(60, 18, 4)
+    seen(nodes, *TIMES)
+    times = [0.1, 0.48, 0.77]
+    before = [places(nodes, time) for time in times]
+    assert nodes.led
+    nodes.bodies.hand_over(nodes)
+    assert not nodes.led
+    for time, place in zip(times, before):
+        assert (places(nodes, time) - place).norm(dim=-1).amax() < 0.02
+        linear = nodes.maps(time)[:, :9].reshape(-1, 3, 3) + torch.eye(3)
+        turns = rolled(nodes, time).turns[nodes.bodies.of_node]
+        assert (linear - turns)[nodes.bodies.of_node >= 0].abs().amax() < 0.05
+
+
+@pytest.mark.parametrize("slow", [1.0, 0.0], ids=["as before", "from rest"])
+def test_bodies_are_found_in_a_new_image(nodes, slow):
+    """Even turns are foreseen; from rest, turns are held back by less than what the image says of them."""
+    seen(nodes, 0.5, 0.55, slow=slow)
+    truth = rolled(nodes, 0.6)
+    start = apart(nodes, nodes.bodies.at(0.6), truth)
+    found = find(nodes.bodies, 0.6, nodes.positions, shown(nodes, truth, 0.6))
+    assert apart(nodes, found, truth) < (0.05 if slow else 0.6) * start
+
+
+def test_a_body_beside_all_that_moves_is_looked_for_there(nodes):
+    """It is too far away for steps, and taken only if it fits the image better."""
+    truth = rolled(nodes, 0.5)
+    truth = truth.but(1, Poses(truth.turns, truth.middles + torch.tensor([0.0, 8.0, 0.0])))
+    image = shown(nodes, truth, 0.55)
+    reached = find(nodes.bodies, 0.55, nodes.positions, image)
+    assert (reached.middles - truth.middles)[1].norm() > 4.0
+    middles = iter([None, truth.middles[1]])
+    found = find(nodes.bodies, 0.55, nodes.positions, image._replace(patch=lambda middle: next(middles)))
+    assert (found.middles - truth.middles).norm(dim=-1).amax() < 0.3
+    middles = iter([None, truth.middles[1] + 50.0])
+    found = find(nodes.bodies, 0.55, nodes.positions, image._replace(patch=lambda middle: next(middles)))
+    torch.testing.assert_close(found.middles, reached.middles)
+
+
+def test_a_point_beside_patches_goes_onto_the_nearest():
+    camera = camera_at(width=60, height=40)
+    moving = torch.zeros(40, 60, dtype=torch.bool)
+    moving[5:9, 5:15] = moving[30:36, 40:50] = True
+    moving[20, 30] = True  # too small
+    point = (camera.center + 3.0 * camera.directions(35.0, 25.0)).float()
+    there = onto_patch(moving, camera, point)
+    torch.testing.assert_close(camera.project(there)[0], torch.tensor([45.0, 33.0]), atol=1e-3, rtol=0.0)
+    assert float((there - camera.center).norm()) == pytest.approx(3.0, rel=1e-5)
+    assert onto_patch(moving, camera, there) is None
+    assert onto_patch(torch.zeros_like(moving), camera, point) is None
+
+
+def test_what_an_image_shows_beside_places_is_looked_at():
+    camera = camera_at(width=200, height=100)
+    at = [(100.0, 50.0), (112.0, 50.0), (100.0, 62.0), (140.0, 50.0), (199.5, 50.0), (205.0, 50.0)]
+    points = torch.stack([camera.center + 2.0 * camera.directions(*pixel) for pixel in at]).float()
+    assert near_places(camera, points, points[:1]).tolist() == [True, True, True, False, False, False]
+
+
+def test_quaternions_turn_by_more_than_half_a_turn():
+    angle = torch.tensor(3.5)  # radian
+    half = torch.cat([torch.tensor([0.0, 0.0]), (angle / 2).sin()[None], (angle / 2).cos()[None]])
+    for length in (1.0, 0.3):
+        motion = torch.cat([torch.zeros(3), length * half - IDENTITY])[None]
+        linear = node_maps(motion, torch.zeros(1, 3))[0, :9].reshape(3, 3) + torch.eye(3)
+        torch.testing.assert_close(linear, rotation(0.0, 0.0, 3.5), atol=1e-5, rtol=0.0)
+
+
+@pytest.mark.parametrize("bad", [2, -2])
+def test_a_node_of_a_body_that_there_is_not_is_named(nodes, bad):
+    state = nodes.state_dict()
+    assert nodes.bodies.misfit(state, "bodies.") is None
+    state["bodies.of_node"] = torch.where(torch.arange(60) == 3, bad, state["bodies.of_node"])
+    assert nodes.bodies.misfit(state, "bodies.") == "bodies.of_node"
