@@ -180,10 +180,10 @@ def test_a_body_beside_all_that_moves_is_looked_for_there(nodes):
     reached = find(nodes.bodies, 0.55, nodes.positions, image)
     assert (reached.middles - truth.middles)[1].norm() > 4.0
     middles = iter([None, truth.middles[1]])
-    found = find(nodes.bodies, 0.55, nodes.positions, image._replace(patch=lambda middle: next(middles)))
+    found = find(nodes.bodies, 0.55, nodes.positions, image._replace(patch=lambda body, all_: next(middles)))
     assert (found.middles - truth.middles).norm(dim=-1).amax() < 0.3
     middles = iter([None, truth.middles[1] + 50.0])
-    found = find(nodes.bodies, 0.55, nodes.positions, image._replace(patch=lambda middle: next(middles)))
+    found = find(nodes.bodies, 0.55, nodes.positions, image._replace(patch=lambda body, all_: next(middles)))
     torch.testing.assert_close(found.middles, reached.middles)
 
 
@@ -193,11 +193,13 @@ def test_a_point_beside_patches_goes_onto_the_nearest():
     moving[5:9, 5:15] = moving[30:36, 40:50] = True
     moving[20, 30] = True  # too small
     point = (camera.center + 3.0 * camera.directions(35.0, 25.0)).float()
-    there = onto_patch(moving, camera, point)
+    there = onto_patch(moving, camera, 0, point[None])
     torch.testing.assert_close(camera.project(there)[0], torch.tensor([45.0, 33.0]), atol=1e-3, rtol=0.0)
     assert float((there - camera.center).norm()) == pytest.approx(3.0, rel=1e-5)
-    assert onto_patch(moving, camera, there) is None
-    assert onto_patch(torch.zeros_like(moving), camera, point) is None
+    assert onto_patch(moving, camera, 0, there[None]) is None
+    assert onto_patch(torch.zeros_like(moving), camera, 0, point[None]) is None
+    other = onto_patch(moving, camera, 0, torch.stack([point, there]))  # the nearest is another's
+    torch.testing.assert_close(camera.project(other)[0], torch.tensor([10.0, 7.0]), atol=1e-3, rtol=0.0)
 
 
 def test_what_an_image_shows_beside_places_is_looked_at():

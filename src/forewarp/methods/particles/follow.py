@@ -57,12 +57,13 @@ class Sight(NamedTuple):
     Attributes:
         eye: (3,), the centre of its camera.
         looks: returns it in all sizes, smallest first, with all that is near points (P, 3).
-        patch: returns where a middle (3,) may have gone by what moves in it; None: it may be there.
+        patch: returns where a body may have gone by what moves in it, given all middles (B, 3); None: it may
+            be where it is.
     """
 
     eye: Tensor
     looks: Callable[[Tensor], Sequence[Look]]
-    patch: Callable[[Tensor], Tensor | None] = lambda middle: None
+    patch: Callable[[int, Tensor], Tensor | None] = lambda body, middles: None
 
 
 @torch.no_grad()
@@ -105,7 +106,7 @@ def find(bodies: Bodies, time: float, positions: Tensor, image: Sight) -> Poses:
         share = (time - before) / (bodies.times[near] - before)
         going = bodies.between(others[0], near, min(share, _FARTHEST))
     resting = Poses(going.turns, held.middles)
-    patches = [(body, image.patch(middle)) for body, middle in enumerate(going.middles)]
+    patches = [(body, image.patch(body, going.middles)) for body in range(len(bodies))]
     jumps = [going.but(b, Poses(going.turns, p.expand(len(bodies), 3))) for b, p in patches if p is not None]
 
     motion, maps = positions.new_zeros(len(positions), 7), positions.new_zeros(len(positions), 12)
@@ -225,17 +226,23 @@ def near_places(camera: Camera, points: Tensor, places: Tensor) -> Tensor:
     return seen & near[row.clamp(0, camera.height - 1) // cell, column.clamp(0, camera.width - 1) // cell]
 
 
-def onto_patch(moving: Tensor, camera: Camera, point: Tensor) -> Tensor | None:
-    """Return where a point (3,) is if shifted, as far away as it is, onto the middle of the nearest patch of
-    what moves in an image, (H, W) bool; None if it lies on one, or there is none.
+def onto_patch(moving: Tensor, camera: Camera, number: int, points: Tensor) -> Tensor | None:
+    """Return where one of points (B, 3) is if shifted, as far away as it is, onto the middle of the nearest
+    patch of what moves in an image, (H, W) bool, that holds no other; None if it lies on one or none is free.
     """
-    patches = patches_of(moving)
-    column, row = camera.project(point)[0].tolist()
-    inside = 0 <= row < camera.height and 0 <= column < camera.width
-    if not patches or (inside and any(bool(patch[int(row), int(column)]) for patch in patches)):
+    row, column, seen = (part.cpu() for part in where_seen(camera, points))
+    row, column, patches = (
+        row.clamp(0, camera.height - 1),
+        column.clamp(0, camera.width - 1),
+        patches_of(moving),
+    )
+    on = [seen & patch[row, column] for patch in patches]
+    free = [patch for patch, held in zip(patches, on) if not bool(held.any())]
+    if not free or any(bool(held[number]) for held in on):
         return None
-    middles = torch.stack([patch.nonzero().float().mean(0) for patch in patches]) + 0.5
-    v, u = middles[(middles - torch.tensor([row, column])).norm(dim=-1).argmin()]
+    middles, point = torch.stack([patch.nonzero().float().mean(0) for patch in free]) + 0.5, points[number]
+    at = camera.project(point)[0].flip(-1).cpu()
+    v, u = middles[(middles - at).norm(dim=-1).argmin()]
     eye = camera.center.to(point)
     return eye + (point - eye).norm() * camera.directions(u, v).to(point)
 
