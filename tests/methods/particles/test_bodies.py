@@ -7,7 +7,7 @@ from forewarp.fields.curves import Curve
 from forewarp.methods.particles.bodies import Poses
 from forewarp.methods.particles.follow import Look, Sight, find, near_places, onto_patch
 from forewarp.methods.particles.nodes import Nodes
-from forewarp.ops.nodes import node_maps
+from forewarp.ops.nodes import carry_nodes, node_maps
 from forewarp.scene.camera import Camera
 
 AXIS = torch.linspace(-0.3, 0.3, 4)
@@ -216,6 +216,23 @@ def test_quaternions_turn_by_more_than_half_a_turn():
         motion = torch.cat([torch.zeros(3), length * half - IDENTITY])[None]
         linear = node_maps(motion, torch.zeros(1, 3))[0, :9].reshape(3, 3) + torch.eye(3)
         torch.testing.assert_close(linear, rotation(0.0, 0.0, 3.5), atol=1e-5, rtol=0.0)
+
+
+@torch.no_grad()
+def test_a_quaternion_of_length_0_turns_nothing():
+    """By the kernel and without it; a file may hold one."""
+    rotations = (-IDENTITY).repeat(3, 1, 1)
+    motion, maps = carry_nodes(torch.ones(3, 1, 3), rotations, torch.ones(1), torch.rand(3, 3))
+    for found in (maps, node_maps(motion, torch.rand(3, 3))):
+        torch.testing.assert_close(found, torch.tensor([0.0] * 9 + [1.0] * 3).repeat(3, 1))
+
+
+def test_a_twist_that_is_no_number_leaves_the_pose(nodes):
+    nodes.bodies.twists.data[0, 3] = torch.nan
+    before = nodes.bodies.middles.clone()
+    nodes.bodies.settle()
+    assert torch.equal(nodes.bodies.middles, before)
+    assert not bool(nodes.bodies.twists.any())
 
 
 @pytest.mark.parametrize("bad", [2, -2])

@@ -1,8 +1,8 @@
 """Following bodies in a film: where each of them is in an image that no step has used yet.
 
-A body is looked for from where it would go on as before. It slides to where a small image shows it; then
-damped Newton steps fit larger ones, which keep as it goes what an image tells little about: how far away it
-is, and how it turns about what is not the camera's axis.
+A body is looked for from where it would be if it went on as before. It is shifted to where a small image
+shows it; then damped Newton steps fit its pose to larger images. They hold back what an image tells little
+about: how far away it is, and how it turns about axes across the view.
 """
 
 from __future__ import annotations
@@ -43,8 +43,8 @@ _SEEN = 0.5  # opacity from which on the ground is known
 
 
 class Look(NamedTuple):
-    """An image in one size: ``compare`` returns how far it is off, given maps (M, 12) of nodes, after the
-    gradients by these; ``focal`` is the camera's focal length, pixels.
+    """An image in one size: given maps (M, 12) of nodes, ``compare`` returns the gradients (M, 12) by these
+    of the loss, and the loss; ``focal`` is the camera's focal length, pixels.
     """
 
     compare: Callable[[Tensor], tuple[Tensor, float]]
@@ -231,11 +231,8 @@ def onto_patch(moving: Tensor, camera: Camera, number: int, points: Tensor) -> T
     patch of what moves in an image, (H, W) bool, that holds no other; None if it lies on one or none is free.
     """
     row, column, seen = (part.cpu() for part in where_seen(camera, points))
-    row, column, patches = (
-        row.clamp(0, camera.height - 1),
-        column.clamp(0, camera.width - 1),
-        patches_of(moving),
-    )
+    row, column = row.clamp(0, camera.height - 1), column.clamp(0, camera.width - 1)
+    patches = patches_of(moving)
     on = [seen & patch[row, column] for patch in patches]
     free = [patch for patch, held in zip(patches, on) if not bool(held.any())]
     if not free or any(bool(held[number]) for held in on):
