@@ -39,13 +39,15 @@ def below(still, frame):
 
 @pytest.fixture(scope="module")
 def film():
-    """Two windows that begin from the same particles, each with random ones of its own."""
+    """Two windows that begin from the same particles, each with random ones of its own; rotations of the
+    second are quaternions.
+    """
     data = small_data()
     still, generator = module_with(data, **BARE).method, torch.Generator().manual_seed(0)
     sources, cameras = [], [frame.camera for frame in data.scene.train]
-    for span, begin in zip(SPANS, (0.0, 0.5)):
+    for span, begin, numbers in zip(SPANS, (0.0, 0.5), ({}, {"bodies": 0.5})):
         module = module_with(data, **EVERY)
-        start = Start(data.scene, "fine", {}, list(range(len(cameras))), None, still, shares=True)
+        start = Start(data.scene, "fine", numbers, list(range(len(cameras))), None, still, shares=True)
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(shared, "wrong_pixels", below)
             module.method = method = Particles(start, **EVERY)
@@ -90,6 +92,7 @@ def test_each_time_is_drawn_by_its_window(film, written, quality, least):
     scene = forewarp.load(file)
     assert facts["windows"] == 2
     assert facts["shared"] > 5
+    assert motion_of(unpacked(file.read_bytes())[0])["features"] == ["quaternions", "windows"]
     for time in TIMES:
         camera = film.cameras[1]
         assert psnr(scene.render(camera, time).rgb, image(film, camera, time)) > least, time
