@@ -1,11 +1,13 @@
 """Bodies: poses at times, gradients by turns and shifts, curves that take over, images that show them."""
 
+import math
+
 import pytest
 import torch
 
 from forewarp.fields.curves import Curve
 from forewarp.methods.particles.bodies import Poses
-from forewarp.methods.particles.follow import Look, Sight, find, near_places, onto_patch
+from forewarp.methods.particles.follow import Look, Sight, find, find_shift, fit_distances, near_places
 from forewarp.methods.particles.nodes import Nodes
 from forewarp.ops.nodes import carry_nodes, node_maps
 from forewarp.scene.camera import Camera
@@ -172,34 +174,55 @@ def test_bodies_are_found_in_a_new_image(nodes, slow):
     assert apart(nodes, found, truth) < (0.05 if slow else 0.6) * start
 
 
-def test_a_body_beside_all_that_moves_is_looked_for_there(nodes):
-    """It is too far away for steps, and taken only if it fits the image better."""
+def test_distances_are_where_images_are_alike_or_go_there(nodes):
+    """At the lowest point of a parabola; if losses bend down, the way they fall; by broken ones, nowhere."""
+    poses = rolled(nodes, 0.5)
+    far = (poses.middles - EYE).norm(dim=-1)
+
+    def reached(loss):
+        found = fit_distances(poses, EYE, lambda now: loss((now.middles - EYE).norm(dim=-1) / far))
+        assert torch.equal(found.turns, poses.turns)
+        return (found.middles - EYE).norm(dim=-1) / far
+
+    best = torch.tensor([1.03, 0.95])
+    torch.testing.assert_close(reached(lambda now: float((now - best).square().sum())), best)
+    torch.testing.assert_close(reached(lambda now: float(now.sum())), torch.full((2,), 0.92))
+    torch.testing.assert_close(reached(lambda now: -float(now.log().sum().exp())), torch.full((2,), 1.08))
+    torch.testing.assert_close(reached(lambda now: float(((now - 1) ** 4 - now / 1e9).sum())), torch.ones(2))
+    torch.testing.assert_close(reached(lambda now: math.nan), torch.ones(2))
+
+
+def test_a_body_is_looked_for_where_it_is_seen_again(nodes):
+    """Where it would go on is too far away for steps; where it is seen again counts if that is better."""
     truth = rolled(nodes, 0.5)
     truth = truth.but(1, Poses(truth.turns, truth.middles + torch.tensor([0.0, 8.0, 0.0])))
     image = shown(nodes, truth, 0.55)
     reached = find(nodes.bodies, 0.55, nodes.positions, image)
     assert (reached.middles - truth.middles)[1].norm() > 4.0
-    middles = iter([None, truth.middles[1]])
-    found = find(nodes.bodies, 0.55, nodes.positions, image._replace(patch=lambda body, all_: next(middles)))
+    found = find(nodes.bodies, 0.55, nodes.positions, image._replace(again=lambda row, going: truth))
     assert (found.middles - truth.middles).norm(dim=-1).amax() < 0.3
-    middles = iter([None, truth.middles[1] + 50.0])
-    found = find(nodes.bodies, 0.55, nodes.positions, image._replace(patch=lambda body, all_: next(middles)))
+    wrong = Poses(truth.turns, truth.middles + 50.0)
+    found = find(nodes.bodies, 0.55, nodes.positions, image._replace(again=lambda row, going: wrong))
     torch.testing.assert_close(found.middles, reached.middles)
 
 
-def test_a_point_beside_patches_goes_onto_the_nearest():
-    camera = camera_at(width=60, height=40)
-    moving = torch.zeros(40, 60, dtype=torch.bool)
-    moving[5:9, 5:15] = moving[30:36, 40:50] = True
-    moving[20, 30] = True  # too small
-    point = (camera.center + 3.0 * camera.directions(35.0, 25.0)).float()
-    there = onto_patch(moving, camera, 0, point[None])
-    torch.testing.assert_close(camera.project(there)[0], torch.tensor([45.0, 33.0]), atol=1e-3, rtol=0.0)
-    assert float((there - camera.center).norm()) == pytest.approx(3.0, rel=1e-5)
-    assert onto_patch(moving, camera, 0, there[None]) is None
-    assert onto_patch(torch.zeros_like(moving), camera, 0, point[None]) is None
-    other = onto_patch(moving, camera, 0, torch.stack([point, there]))  # the nearest is another's
-    torch.testing.assert_close(camera.project(other)[0], torch.tensor([10.0, 7.0]), atol=1e-3, rtol=0.0)
+def test_a_part_of_an_image_is_found_again_in_another_light_and_at_its_border():
+    """Of its rectangle, only what is in the mask must be alike; half of that must lie inside."""
+    noise = [torch.rand(40, 50, generator=torch.Generator().manual_seed(seed)) for seed in (0, 1, 2)]
+    image, mask = noise[0], torch.zeros(40, 50, dtype=torch.bool)
+    mask[10:20, 12:24] = True
+    mask[10:16, 12:20] = False
+    around = torch.tensor([4, 1])
+    for x, y, inside in ((7, -5, 1), (-9, 8, 1), (0, 0, 1), (24, 3, 1), (28, 0, 1), (30, 0, 0), (34, 0, 0)):
+        wide = torch.cat([noise[1], noise[2]], 1)
+        wide[10 + y : 20 + y, 12 + x : 24 + x][mask[10:20, 12:24]] = 0.6 * image[mask] + 0.3
+        found = find_shift(image, mask, wide[:36, :50], around, 30)
+        assert (found is not None and found.tolist() == [x, y]) == bool(inside)
+    stripes = noise[0][:, :1].expand(40, 50)  # beyond the border they would go on
+    found = find_shift(stripes, mask, torch.cat([noise[1][:, :49], stripes[:, :1]], 1), around, 40)
+    assert found is None or found[0] < 30
+    assert find_shift(image, mask, torch.full((40, 50), 0.5), around, 5) is None
+    assert find_shift(image, mask & ~mask, image, around, 5) is None
 
 
 def test_what_an_image_shows_beside_places_is_looked_at():

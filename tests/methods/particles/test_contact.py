@@ -9,9 +9,11 @@ import torch
 from forewarp.methods.method import Start
 from forewarp.methods.particles.bodies import Poses
 from forewarp.methods.particles.contact import set_down, things_on_the_ground
+from forewarp.methods.particles.follow import _again, follow
 from forewarp.methods.particles.model import Particles
 from forewarp.ops.gaussians import FLAT, moved
 from forewarp.scene.frame import where_seen
+from forewarp.scene.view import Moment, Observation, View
 from tests.support.particles import BARE, MOVING, look, module_with, small_data
 
 DATA = small_data()
@@ -158,15 +160,79 @@ def test_a_checkpoint_is_loaded_without_a_look_at_masks(before):
     assert len(Particles(start, **MOVING).means) == len(method.means)
 
 
-def test_bodies_lead_until_their_share_of_the_stage_is_over(before, monkeypatch):
-    """A step at an image follows them there, and is of their poses alone; nothing rests before it is over."""
+@pytest.fixture
+def led(before, monkeypatch):
+    """Particles of a fine stage with a body, and their scene."""
     monkeypatch.setattr("forewarp.methods.particles.nodes._FEWEST", 1)
     monkeypatch.setattr("forewarp.methods.particles.contact._SMALL", 0.2)
     rests = torch.ones(SIZE, dtype=torch.bool)
     scene = scene_with(masked((6, 12, 6, 14)), load_resting=lambda: rests)
     numbers = {"rest_by_masks": True, "bodies": 0.5}
     start = Start(scene, "fine", numbers, list(range(len(scene.train))), None, before[0], False)
-    fine = Particles(start, **MOVING | {"background": 0.03})
+    return Particles(start, **MOVING | {"background": 0.03}), scene
+
+
+def test_a_body_is_moved_to_where_it_is_as_large_as_shown(led):
+    """In the second of four rounds and the others, once each; in the first its shape is not known yet."""
+    fine, scene = led
+    bodies, view = fine.nodes.bodies, View(FRAME.camera)
+    moment = Moment(next(time for time in sorted(fine.frames) if not bodies.seen[bodies.row(time)]))
+    row = bodies.row(moment.time)
+    bodies.seen[row] = True
+    drawn = fine.at(moment).render(view, torch.zeros(3)).rgb
+    image = torch.cat([(255 * drawn.clamp(0, 1)).round(), torch.full((len(drawn), 1), 255.0)], 1)
+    seen = Observation(moment, view, image.to(torch.uint8), torch.zeros(3))
+    eye, there = FRAME.camera.center.float(), bodies.middles[0, row].clone()
+
+    def off(progress, share):
+        fine.progress = progress
+        if share is not None:
+            bodies.middles[0, row] = eye + share * (there - eye)
+        follow(fine, seen, fine.frames)
+        return float((bodies.middles[0, row] - eye).norm() / (there - eye).norm()) - 1
+
+    assert abs(off(0.12, 1.05) - 0.05) < 1e-5
+    assert abs(off(0.13, None)) < 0.03
+    assert abs(off(0.24, 0.95) + 0.05) < 1e-5
+    assert abs(off(0.26, None)) < 0.03
+    seen = replace(seen, moment=Moment(scene.canonical_time))  # there it is where it was set down
+    row = bodies.row(scene.canonical_time)
+    assert abs(off(0.4, 1.05) - 0.05) < 1e-5
+
+
+def test_a_body_is_seen_again_beside_where_it_was(led):
+    """A pixel beside it, as far away and turned as it would go on. What is around it goes elsewhere, and
+    the camera pans.
+    """
+    fine, scene = led
+    bodies = fine.nodes.bodies
+    row = bodies.row(scene.canonical_time)
+    held = bodies.middles[:, row]
+    before = fine.frames[bodies.times[row]]
+    camera = before.camera
+    panned = replace(camera, cx=camera.cx + 4)
+    fine.opacity.data.fill_(1.0)
+    image = torch.randint(0, 255, (*SIZE, 3), generator=torch.Generator().manual_seed(0)).to(torch.uint8)
+    other = image.flip(0, 1)
+    rows, columns, _ = where_seen(camera, fine.means.data[fine.skinning.shares.sum(-1) > 0])
+    window = [slice(int(x.amin()) - 1, int(x.amax()) + 2) for x in (rows, columns)]
+    went = [slice(part.start + off, part.stop + off) for part, off in zip(window, (1, 3), strict=True)]
+    other[tuple(went)] = image[tuple(window)]
+    frames = {bodies.times[row]: replace(before, load=lambda: image)}
+    frames[0.9] = replace(before, camera=panned, load=lambda: other)
+    turns = torch.tensor([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])[None]
+    found = _again(fine, frames, 0.9, row, Poses(turns, held))
+    assert torch.equal(found.turns, turns)
+    was, now, eye = camera.project(held)[0], panned.project(found.middles)[0], camera.center.float()
+    torch.testing.assert_close(now - was, torch.tensor([[3.0, 1.0]]).to(was), atol=1e-3, rtol=0)
+    torch.testing.assert_close((found.middles - eye).norm(), (held - eye).norm())
+    frames[0.9] = replace(before, load=lambda: torch.full_like(image, 90))
+    assert torch.equal(_again(fine, frames, 0.9, row, Poses(turns, held)).middles, held)
+
+
+def test_bodies_lead_until_their_share_of_the_stage_is_over(led):
+    """A step at an image follows them there, and is of their poses alone; nothing rests before it is over."""
+    fine, scene = led
     groups = [{"name": n, "params": p, "lr": 1e-3, "base_lr": 1e-3} for n, p in fine.param_groups().items()]
     optimizer, bodies = fine.optimizer(groups), fine.nodes.bodies
     index = max(range(len(scene.train)), key=lambda i: abs(scene.train[i].time - scene.canonical_time))

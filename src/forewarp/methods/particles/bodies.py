@@ -29,6 +29,10 @@ class Poses(NamedTuple):
     turns: Tensor
     middles: Tensor
 
+    def farther(self, body: int, eye: Tensor, times: float) -> Poses:
+        """Return these, with one body so many times as far from an eye (3,), along the same ray."""
+        return self.but(body, Poses(self.turns, eye + times * (self.middles - eye)))
+
     def but(self, body: int, other: Poses) -> Poses:
         """Return these, with one body's of others."""
         made = Poses(self.turns.clone(), self.middles.clone())
@@ -69,6 +73,9 @@ class Bodies(nn.Module):
         self.register_buffer("seen", torch.zeros(len(times), dtype=torch.bool))
         self.register_buffer("eyes", torch.zeros(len(times), 3))  # from where they were seen, and how far
         self.register_buffer("farthest", torch.full((count, len(times)), torch.inf))  # from there they may be
+        self.register_buffer(
+            "rounds", torch.zeros(len(times), dtype=torch.int64)
+        )  # of fits that images were in
         self.register_buffer("lead", torch.tensor(count > 0))
         self.seen[self.row(canonical_time)] = True
 

@@ -110,7 +110,7 @@ def things_on_the_ground(moving: Tensor, depth: Tensor) -> list[tuple[Tensor, fl
     """
     height, found = len(depth), []
     below = max(1, round(_BELOW * height))
-    for thing in patches_of(moving):
+    for thing in _patches_of(moving):
         rows = thing.any(1).nonzero()[:, 0]
         top, bottom = int(rows[0]), int(rows[-1])
         if bottom + below >= height:
@@ -125,7 +125,7 @@ def things_on_the_ground(moving: Tensor, depth: Tensor) -> list[tuple[Tensor, fl
     return found
 
 
-def patches_of(moving: Tensor) -> list[Tensor]:
+def _patches_of(moving: Tensor) -> list[Tensor]:
     """Tell the patches of a mask (H, W) bool apart: a mask of each that is not tiny."""
     from scipy.ndimage import label  # late, as its import takes time
 

@@ -1,14 +1,15 @@
 """Following bodies in a film: where each of them is in an image that no step has used yet.
 
-A body is looked for from where it would be if it went on as before. It is shifted to where a small image
-shows it; then damped Newton steps fit its pose to larger images. They hold back what an image tells little
-about: how far away it is, and how it turns about axes across the view.
+A body is looked for from where it would be if it went on as before, or where what the nearest image shows of
+it is seen again. It is shifted to where a small image shows it; then damped Newton steps fit its pose to
+larger images. They hold back what an image tells little about: how far away it is, and how it turns about
+axes across the view. Once its shape is known, how large an image shows it tells how far away it is.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, NamedTuple
@@ -17,11 +18,11 @@ import torch
 from torch import Tensor
 
 from forewarp.methods.particles.bodies import Bodies, Poses
-from forewarp.methods.particles.contact import patches_of, things_on_the_ground
+from forewarp.methods.particles.contact import things_on_the_ground
 from forewarp.ops.gaussians import Gaussians, Warp, moved
 from forewarp.ops.grid import dilate
 from forewarp.scene.camera import Camera
-from forewarp.scene.frame import where_seen
+from forewarp.scene.frame import Frame, where_seen
 from forewarp.scene.view import Observation, View
 
 if TYPE_CHECKING:
@@ -37,6 +38,11 @@ _SHORTER = 1.0, 0.4  # shares of a step that are tried in turn
 # How much turns, shifts along the ray and all are held back, by the curvature of shifts across the ray.
 _TURN, _RAY, _ANY = 0.4, 10.0, 1e-2
 _TINY = 1e-6
+_ROUNDS = 4  # of fitting distances while bodies lead, the first of them none: shapes are not known yet
+_PROBE, _MOST = 0.04, 0.08  # shares of its distance by which a body is moved to see, and at most
+# Of an image's longer side, how far around a body is looked for in it; and times the way that it would go on.
+_REACH, _FASTER = 0.05, 1.5
+_FARTHEST_OFF, _ALIKE = 0.25, 0.3  # of that side, how far at most; the least correlation
 _FARTHEST = 3.0  # times the way between the two nearest images that a body may have gone on from the first
 _CELL = 0.05  # of an image's longer side: what lies within about one of a body is looked at with it
 _SEEN = 0.5  # opacity from which on the ground is known
@@ -57,46 +63,54 @@ class Sight(NamedTuple):
     Attributes:
         eye: (3,), the centre of its camera.
         looks: returns it in all sizes, smallest first, with all that is near points (P, 3).
-        patch: returns where a body may have gone by what moves in it, given all middles (B, 3); None: it may
-            be where it is.
+        again: looks in it for what the image of a row shows of bodies, given where they would go on, and
+            returns poses there.
     """
 
     eye: Tensor
     looks: Callable[[Tensor], Sequence[Look]]
-    patch: Callable[[int, Tensor], Tensor | None] = lambda body, middles: None
+    again: Callable[[int, Poses], Poses] = lambda row, going: going
 
 
 @torch.no_grad()
-def follow(particles: Particles, seen: Observation, load_moving: Callable[[], Tensor] | None) -> None:
-    """Look for where the bodies of particles are in an image; nothing is done if that was done before.
+def follow(particles: Particles, seen: Observation, frames: Mapping[float, Frame]) -> None:
+    """Look for where the bodies of particles are in an image; if that was done, fit their distances at times.
 
     Args:
         particles: whose bodies lead.
         seen: a whole training image.
-        load_moving: gives (H, W) bool, what moves in it; None: that is not known.
+        frames: all training images, by time.
 
-    Cost: about 80 comparisons of small images with what is near bodies.
+    Cost: about 80 comparisons of small images with what is near bodies; two images are loaded.
     """
     nodes, time, camera = particles.nodes, seen.moment.time, seen.view.camera
     bodies = nodes.bodies
-    if bool(bodies.seen[bodies.row(time)]):
+    row, number = bodies.row(time), int(_ROUNDS * particles.progress / particles.stage.bodies)
+    known, late = bool(bodies.seen[row]), int(bodies.rounds[row]) < number
+    late &= row != bodies.row(nodes.curve.canonical_time)  # there they are where they were set down
+    bodies.rounds[row] = number
+    if known:
+        if late:
+            _refit(particles, seen)
         return
-    image = Sight(camera.center.to(nodes.positions), partial(_looks, particles, seen))
-    moving = None if load_moving is None else load_moving()
-    if moving is not None:
-        image = image._replace(patch=partial(onto_patch, moving, camera))
+    again = partial(_again, particles, frames, time)
+    image = Sight(camera.center.to(nodes.positions), partial(_looks, particles, seen), again)
     found = find(bodies, time, nodes.positions, image)
     if not all(bool(part.isfinite().all()) for part in found):
         found = bodies.at(time)
     bodies.put(time, found, image.eye)
+    if late:
+        _refit(particles, seen)
+    load_moving = frames[time].load_moving
+    moving = None if load_moving is None else load_moving()
     bodies.bring_before(time, _farthest(particles, seen, moving))
 
 
 def find(bodies: Bodies, time: float, positions: Tensor, image: Sight) -> Poses:
     """Return where bodies are in an image of a time that was not seen, with nodes at rest ``positions``.
 
-    It is looked for from where they would go on as before or, if that fits a small image better, from where
-    they were, turning on; and from the nearest of what moves, if they were then beside all of it.
+    They are looked for where they would go on as before or, if that fits a small image better, where they
+    were, turning on, or are seen again.
     """
     rows = bodies.seen.nonzero()[:, 0].tolist()
     near, *others = sorted(rows, key=lambda row: abs(bodies.times[row] - time))
@@ -106,12 +120,11 @@ def find(bodies: Bodies, time: float, positions: Tensor, image: Sight) -> Poses:
         share = (time - before) / (bodies.times[near] - before)
         going = bodies.between(others[0], near, min(share, _FARTHEST))
     resting = Poses(going.turns, held.middles)
-    patches = [(body, image.patch(body, going.middles)) for body in range(len(bodies))]
-    jumps = [going.but(b, Poses(going.turns, p.expand(len(bodies), 3))) for b, p in patches if p is not None]
+    again = image.again(near, going)
 
     motion, maps = positions.new_zeros(len(positions), 7), positions.new_zeros(len(positions), 12)
     places = []
-    for way in (going, resting, *jumps):
+    for way in (going, resting, again):
         bodies.carry(way, positions, motion, maps)
         places.append((positions + motion[:, :3])[bodies.of_node >= 0])
     first, *looks = image.looks(torch.cat(places))
@@ -121,18 +134,57 @@ def find(bodies: Bodies, time: float, positions: Tensor, image: Sight) -> Poses:
         by_maps, loss = look.compare(maps)
         return bodies.by_twists(poses, by_maps), loss
 
-    def found(poses: Poses) -> tuple[Poses, float]:
-        poses = start = _slid(bodies, poses, image.eye, first, partial(compared, first))
-        for look, steps in zip(looks, _STEPS, strict=True):
-            poses, loss = _fitted(bodies, poses, start, image.eye, look, partial(compared, look), steps)
-        return poses, loss
-
     start, least = going, compared(first, going)[1]
     for body in range(len(bodies)):
-        tried = start.but(body, resting)
-        if (loss := compared(first, tried)[1]) < least:
-            start, least = tried, loss
-    return min((found(way) for way in (start, *jumps)), key=lambda best: best[1])[0]
+        for way in (resting, again):
+            tried = start.but(body, way)
+            if (loss := compared(first, tried)[1]) < least:
+                start, least = tried, loss
+    poses = start = _slid(bodies, start, image.eye, first, partial(compared, first))
+    for look, steps in zip(looks, _STEPS, strict=True):
+        poses = _fitted(bodies, poses, start, image.eye, look, partial(compared, look), steps)
+    return poses
+
+
+def fit_distances(poses: Poses, eye: Tensor, compared: Callable[[Poses], float]) -> Poses:
+    """Move bodies along their rays from an eye (3,) to where an image shows them in their size: the best of
+    four places, which are nearer, as it is, farther, and where a parabola through these losses is lowest or,
+    if they bend down, the way they fall; at most ``_MOST`` of its distance away.
+
+    Args:
+        poses: of bodies.
+        eye: from where they are seen.
+        compared: returns the loss of the image.
+    """
+    now = compared(poses)
+    for body in range(len(poses.middles)):
+        places = [poses.farther(body, eye, times) for times in (1 - _PROBE, 1 + _PROBE)]
+        near, far = losses = [compared(place) for place in places]
+        bend = near + far - 2 * now
+        step = 0.5 * _PROBE * (near - far) / bend if bend > 0 else math.copysign(_MOST, near - far)
+        places.append(poses.farther(body, eye, 1 + min(max(step, -_MOST), _MOST)))
+        losses.append(compared(places[-1]))
+        for place, loss in zip(places, losses, strict=True):
+            if loss < now:
+                poses, now = place, loss
+    return poses
+
+
+def _refit(particles: Particles, seen: Observation) -> None:
+    """Fit distances of bodies to an image in which they were found."""
+    nodes, time, eye = particles.nodes, seen.moment.time, seen.view.camera.center
+    bodies, positions = nodes.bodies, nodes.positions
+    motion, maps = positions.new_zeros(len(positions), 7), positions.new_zeros(len(positions), 12)
+    poses, eye = bodies.at(time), eye.to(positions)
+    bodies.carry(poses, positions, motion, maps)
+    places = (positions + motion[:, :3])[bodies.of_node >= 0]
+    (look,) = _looks(particles, seen, places, _SIDES[-1:])
+
+    def compared(poses: Poses) -> float:
+        bodies.carry(poses, positions, motion, maps)
+        return look.compare(maps)[1]
+
+    bodies.put(time, fit_distances(poses, eye, compared), eye)
 
 
 def _slid(bodies: Bodies, poses: Poses, eye: Tensor, look: Look, compared: Callable) -> Poses:
@@ -152,8 +204,8 @@ def _slid(bodies: Bodies, poses: Poses, eye: Tensor, look: Look, compared: Calla
 
 def _fitted(
     bodies: Bodies, poses: Poses, start: Poses, eye: Tensor, look: Look, compared: Callable, steps: int
-) -> tuple[Poses, float]:
-    """Fit poses to an image by damped Newton steps that hold them back where they start; return the loss too.
+) -> Poses:
+    """Fit poses to an image by damped Newton steps that hold them back where they start.
 
     Second derivatives are differences of gradients.
     """
@@ -192,18 +244,20 @@ def _fitted(
                 break
         else:
             break
-    return poses, loss
+    return poses
 
 
-def _looks(particles: Particles, seen: Observation, places: Tensor) -> list[Look]:
-    """Return an image in all sizes, with the particles that are bodies' or near places (P, 3)."""
+def _looks(
+    particles: Particles, seen: Observation, places: Tensor, sides: Sequence[int] = _SIDES
+) -> list[Look]:
+    """Return an image in some sizes, with the particles that are bodies' or near places (P, 3)."""
     camera, moment, skinning = seen.view.camera, seen.moment, particles.skinning
     means, _ = moved(particles.means, particles.warp(moment.time))
     near = near_places(camera, means, places)
-    near |= particles.nodes.bodies.of_node[skinning.links[:, 0].long()] >= 0
+    near |= _body_of(particles) >= 0
     part = Gaussians(*(values[near] for values in particles.gaussians(particles.light(moment))))
     links, weights, looks = skinning.links[near], skinning.weights()[near], []
-    for side in _SIDES:
+    for side in sides:
         small = seen.smaller(max(1.0, max(camera.width, camera.height) / side))
 
         def compare(maps: Tensor, small: Observation = small) -> tuple[Tensor, float]:
@@ -226,22 +280,91 @@ def near_places(camera: Camera, points: Tensor, places: Tensor) -> Tensor:
     return seen & near[row.clamp(0, camera.height - 1) // cell, column.clamp(0, camera.width - 1) // cell]
 
 
-def onto_patch(moving: Tensor, camera: Camera, number: int, points: Tensor) -> Tensor | None:
-    """Return where one of points (B, 3) is if shifted, as far away as it is, onto the middle of the nearest
-    patch of what moves in an image, (H, W) bool, that holds no other; None if it lies on one or none is free.
+def _again(particles: Particles, frames: Mapping[float, Frame], time: float, row: int, going: Poses) -> Poses:
+    """Look in the image of a time for what that of a row shows of bodies, around where they then were; the
+    farther around, the farther they would be if they went on. Return poses turned as they would be, as far
+    from the new eye as they were; what is not found stays where it was.
     """
-    row, column, seen = (part.cpu() for part in where_seen(camera, points))
-    row, column = row.clamp(0, camera.height - 1), column.clamp(0, camera.width - 1)
-    patches = patches_of(moving)
-    on = [seen & patch[row, column] for patch in patches]
-    free = [patch for patch, held in zip(patches, on) if not bool(held.any())]
-    if not free or any(bool(held[number]) for held in on):
+    bodies = particles.nodes.bodies
+    held = Poses(bodies.turns[:, row], bodies.middles[:, row])
+    nearest_time = min(frames, key=lambda other: abs(other - bodies.times[row]))
+    (image, camera), (other, after) = _small(frames[nearest_time]), _small(frames[time])
+    of, eye, found = _body_of(particles), after.center.to(held.middles), Poses(going.turns, held.middles)
+    was, here, there = (
+        view.project(middles)[0].cpu()
+        for view, middles in ((camera, held.middles), (after, held.middles), (after, going.middles))
+    )
+    for body in range(len(bodies)):
+        own = (of == body) & (particles.opacity[:, 0] > 0)
+        points = (particles.means[own] - bodies.rest[body]) @ held.turns[body].T + held.middles[body]
+        rows, columns, seen = (part.cpu() for part in where_seen(camera, points))
+        mask = torch.zeros(image.shape, dtype=torch.bool)
+        mask[rows[seen], columns[seen]] = True
+        reach = _REACH * max(image.shape) + _FASTER * float((there - here)[body].norm())
+        reach = math.ceil(min(_FARTHEST_OFF * max(image.shape), reach))
+        shift = find_shift(image, dilate(mask), other, (here - was)[body].round().long(), reach)
+        if shift is not None:
+            ray = after.directions(*(was[body] + shift)).to(eye)
+            middle = eye + (held.middles[body] - eye).norm() * ray
+            found = found.but(body, Poses(going.turns, middle.expand_as(held.middles)))
+    return found
+
+
+def _body_of(particles: Particles) -> Tensor:
+    """Return the body that each particle is of, (N,); -1: of none, or at rest."""
+    skinning = particles.skinning
+    of = particles.nodes.bodies.of_node[skinning.links[:, 0].long()]
+    return of.where(skinning.shares.sum(-1) > 0, -1)
+
+
+def _small(frame: Frame) -> tuple[Tensor, Camera]:
+    """Return a frame's image in grey (h, w), as large as the largest that is looked at, and its camera."""
+    camera = _shrunk(frame.camera)
+    grey = frame.load()[..., :3].float().mean(-1) / 255
+    size = camera.height, camera.width
+    return torch.nn.functional.interpolate(grey[None, None], size, mode="area")[0, 0], camera
+
+
+def _shrunk(camera: Camera) -> Camera:
+    """Return a camera of as large images as the largest that are looked at."""
+    share = min(1.0, _SIDES[-1] / max(camera.width, camera.height))
+    return camera.resized(*(max(1, round(share * side)) for side in (camera.width, camera.height)))
+
+
+def find_shift(image: Tensor, mask: Tensor, other: Tensor, around: Tensor, reach: int) -> Tensor | None:
+    """Find by how far what an image (H, W) shows in a mask (H, W) is shifted in another one (h, w): to where
+    both correlate best, whatever their light, and half of the mask is inside.
+
+    Args:
+        image, mask, other: the images, and what is looked for.
+        around: (2,) int64, x and y: a shift.
+        reach: by how many pixels at most it may differ from that.
+
+    Returns:
+        (2,) int64, x and y; None if nothing is alike.
+    """
+    if not bool(mask.any()):
         return None
-    middles, point = torch.stack([patch.nonzero().float().mean(0) for patch in free]) + 0.5, points[number]
-    at = camera.project(point)[0].flip(-1).cpu()
-    v, u = middles[(middles - at).norm(dim=-1).argmin()]
-    eye = camera.center.to(point)
-    return eye + (point - eye).norm() * camera.directions(u, v).to(point)
+    (top, left), (bottom, right) = (f(mask.nonzero(), 0) for f in (torch.amin, torch.amax))
+    part, inside = (values[top : bottom + 1, left : right + 1].float() for values in (image, mask))
+    columns, rows = (
+        torch.arange(int(low + off) - reach, int(high + off) + reach + 1)
+        for low, high, off in zip((left, top), (right, bottom), around)
+    )
+    field = other[rows.clamp(0, len(other) - 1)][:, columns.clamp(0, other.shape[1] - 1)]
+    is_inside = ((rows >= 0) & (rows < len(other)))[:, None] & (columns >= 0) & (columns < other.shape[1])
+
+    def summed(values: Tensor, kernel: Tensor) -> Tensor:
+        return torch.nn.functional.conv2d(values[None, None], kernel[None, None])[0, 0]
+
+    part = (part - (part * inside).sum() / inside.sum()) * inside
+    spread = summed(field.square(), inside) - summed(field, inside).square() / inside.sum()
+    alike = summed(field, part) / (spread.clamp(min=_TINY).sqrt() * part.norm().clamp(min=_TINY))
+    alike = alike.where(summed(is_inside.float(), inside) >= 0.5 * inside.sum(), -1.0)
+    row, column = divmod(int(alike.argmax()), alike.shape[1])
+    if float(alike[row, column]) < _ALIKE:
+        return None
+    return around + torch.tensor([column - reach, row - reach])
 
 
 def _farthest(particles: Particles, seen: Observation, moving: Tensor | None) -> Tensor:
@@ -249,8 +372,7 @@ def _farthest(particles: Particles, seen: Observation, moving: Tensor | None) ->
     below the patch of what moves (H, W) that it is alone in, whichever is farther: shadows move, too.
     """
     camera, bodies, skinning = seen.view.camera, particles.nodes.bodies, particles.skinning
-    share = min(1.0, _SIDES[-1] / max(camera.width, camera.height))
-    camera = camera.resized(*(max(1, round(share * side)) for side in (camera.width, camera.height)))
+    camera = _shrunk(camera)
     size = camera.height, camera.width
     whole = particles.at(seen.moment)
     rests = skinning.shares.sum(-1) == 0
@@ -259,8 +381,8 @@ def _farthest(particles: Particles, seen: Observation, moving: Tensor | None) ->
     drawn = part.render(View(camera), torch.zeros(3, device=rests.device)).shaped(*size)
     depth = torch.where(drawn.opacity > _SEEN, drawn.depth, 0.0).cpu()
     row, column, shown = where_seen(camera, moved(particles.means, whole.warp)[0])
-    of = bodies.of_node[skinning.links[:, 0].long()]
-    own = [shown & (of == body) & ~rests for body in range(len(bodies))]
+    of = _body_of(particles)
+    own = [shown & (of == body) for body in range(len(bodies))]
     masks = torch.zeros(len(bodies), *size, dtype=torch.bool)
     for mask, which in zip(masks, own):
         mask[row[which].cpu(), column[which].cpu()] = True

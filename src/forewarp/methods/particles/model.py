@@ -96,7 +96,7 @@ class Particles(Method):
         # Whether a step's images come with planes beside their colours, which the kernels are compiled for.
         self.has_planes = any(f.load_valid or (self.asks.sensed and f.load_sensed) for f in train)
         self.views = len(train)
-        self.masks = {frame.time: frame.load_moving for frame in train}
+        self.frames = {frame.time: frame for frame in train}
         effects = Effects(**choices).only(self.stage.effects, len(times))
         self.ends = min(times), max(times)
         self.progress = self.decay = self.hidden_decay = 0.0
@@ -284,7 +284,7 @@ class Particles(Method):
         squared, numbers, views, has_depth = 0.0, 0, len(batch.observations), False
         for whole in batch.observations:
             if self.nodes is not None and self.nodes.led:
-                follow(self, whole, self.masks[whole.moment.time])
+                follow(self, whole, self.frames)
             seen = self._smaller(whole)
             covered = float(self.covered_pixels) * len(seen.view) / len(whole.view)
             squared_error, of_image, found = self._compare(seen, factors, generator, views, covered)
@@ -528,7 +528,7 @@ class Particles(Method):
     @torch.no_grad()
     def only(self, rows: Tensor) -> Particles:
         """See ``HasLayers``."""
-        part = copy.deepcopy(self)
+        part = copy.deepcopy(self, {id(self.frames): self.frames})
         keep_rows(part, rows.nonzero()[:, 0] if rows.dtype == torch.bool else rows)
         return part
 
