@@ -9,7 +9,7 @@ import torch
 from forewarp.methods.method import Start
 from forewarp.methods.particles.bodies import Poses
 from forewarp.methods.particles.contact import set_down, things_on_the_ground
-from forewarp.methods.particles.follow import _again, follow
+from forewarp.methods.particles.follow import _again, _body_of, follow, put_on_ground
 from forewarp.methods.particles.model import Particles
 from forewarp.ops.gaussians import FLAT, moved
 from forewarp.scene.frame import where_seen
@@ -230,6 +230,36 @@ def test_a_body_is_seen_again_beside_where_it_was(led):
     assert torch.equal(_again(fine, frames, 0.9, row, Poses(turns, held)).middles, held)
 
 
+def test_bodies_grow_until_they_touch_the_ground_and_images_stay_alike(led):
+    fine, scene = led
+    bodies, view, eye = fine.nodes.bodies, View(FRAME.camera), FRAME.camera.center.float()
+    canonical, time = scene.canonical_time, next(t for t in sorted(fine.frames) if t != scene.canonical_time)
+    row, far = bodies.row(time), (bodies.rest - eye).norm(dim=-1)
+    bodies.eyes[bodies.row(canonical)] = eye
+    fine.opacity.data[_body_of(fine) < 0] = -20.0  # these would hide them
+
+    def images():
+        canon, turned = (fine.at(Moment(t)).render(view, torch.zeros(3)) for t in (canonical, time))
+        return canon.opacity, turned.opacity, turned.rgb  # at rest all are equally far away, in any order
+
+    turn = torch.tensor([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])[None]
+    bodies.put(time, Poses(turn, eye + 0.5 * (bodies.rest - eye)), eye)
+    before, means, nodes = images(), fine.means.data.clone(), fine.nodes.positions.clone()
+    put_on_ground(fine)  # no ground is known
+    assert torch.equal(fine.means.data, means)
+    bodies.farthest[:, row] = 1.2 * 0.5 * far
+    put_on_ground(fine)
+    for image, other in zip(images(), before, strict=True):
+        torch.testing.assert_close(image, other, atol=1e-5, rtol=0)
+    torch.testing.assert_close((bodies.middles[:, row] - eye).norm(dim=-1), 1.2 * 0.5 * far)
+    torch.testing.assert_close((bodies.rest - eye).norm(dim=-1), 1.2 * far)
+    grown = torch.where(bodies.of_node >= 0, 1.2, 1.0)[:, None]
+    torch.testing.assert_close(fine.nodes.positions - eye, grown * (nodes - eye))
+    bodies.farthest[:, row] = 0.1 * far  # too far already
+    put_on_ground(fine)
+    torch.testing.assert_close((bodies.rest - eye).norm(dim=-1), 1.2 * far)
+
+
 def test_bodies_lead_until_their_share_of_the_stage_is_over(led):
     """A step at an image follows them there, and is of their poses alone; nothing rests before it is over."""
     fine, scene = led
@@ -249,6 +279,10 @@ def test_bodies_lead_until_their_share_of_the_stage_is_over(led):
     assert fine.nodes.led
     assert not bool(fine.nodes.stopped.any())
     assert not bool(fine.nodes.translations.any())
+    row = bodies.row(time)
+    bodies.farthest[:, row] = 1.3 * (bodies.middles[:, row] - bodies.eyes[row]).norm(dim=-1)
     fine.advance(0.5, 0, optimizer)
+    away = (bodies.middles[:, row] - bodies.eyes[row]).norm(dim=-1)
+    torch.testing.assert_close(away, bodies.farthest[:, row])  # put on the ground
     assert not fine.nodes.led
     assert bool(fine.nodes.translations.any())

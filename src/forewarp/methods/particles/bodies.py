@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
 _LEAST = 1e-15
 _LOOSE = 1e-4  # how much curves are kept small where they are handed over
+_TOUCHES = 0.05  # share of images in which a body touches the ground
 _STEADY = 0.97  # of its distance that a body keeps, whatever is seen below it: masks are not exact
 
 
@@ -175,6 +176,27 @@ class Bodies(nn.Module):
         away = poses.middles - self.eyes[row]
         share = (self.farthest[:, row] / away.norm(dim=-1)).clamp(max=1.0)
         self.turns[:, row], self.middles[:, row] = poses.turns, self.eyes[row] + share[:, None] * away
+
+    @torch.no_grad()
+    def nearest_to_ground(self) -> Tensor:
+        """Return how many times as far away bodies may be (B,), at least 1, until they touch what rests below
+        them in the few images in which they are nearest to it.
+        """
+        away = (self.middles - self.eyes).norm(dim=-1)
+        known = self.seen & self.farthest.isfinite()
+        times = [(self.farthest[b] / away[b])[known[b]] for b in range(len(self))]
+        found = [float(t.quantile(_TOUCHES)) if len(t) else 1.0 for t in times]
+        return self.sizes.new_tensor(found).clamp(min=1.0)
+
+    @torch.no_grad()
+    def enlarge(self, times: Tensor, eye: Tensor) -> None:
+        """Make bodies so many times (B,) as large and as far away, at rest from an eye (3,); what images show
+        stays as it is.
+        """
+        self.rest.copy_(eye + times[:, None] * (self.rest - eye))
+        self.sizes.mul_(times)
+        moved = self.eyes + times[:, None, None] * (self.middles - self.eyes)
+        self.middles.copy_(torch.where(self.seen[:, None], moved, self.rest[:, None]))
 
     @torch.no_grad()
     def hand_over(self, nodes: Nodes) -> None:

@@ -88,7 +88,7 @@ def follow(particles: Particles, seen: Observation, frames: Mapping[float, Frame
     row, number = bodies.row(time), int(_ROUNDS * particles.progress / particles.stage.bodies)
     known, late = bool(bodies.seen[row]), int(bodies.rounds[row]) < number
     late &= row != bodies.row(nodes.curve.canonical_time)  # there they are where they were set down
-    bodies.rounds[row] = number
+    bodies.rounds[row], bodies.eyes[row] = number, camera.center
     if known:
         if late:
             _refit(particles, seen)
@@ -104,6 +104,21 @@ def follow(particles: Particles, seen: Observation, frames: Mapping[float, Frame
     load_moving = frames[time].load_moving
     moving = None if load_moving is None else load_moving()
     bodies.bring_before(time, _farthest(particles, seen, moving))
+
+
+@torch.no_grad()
+def put_on_ground(particles: Particles) -> None:
+    """Make bodies as much larger and farther away as they can be before what rests below them: images tell
+    how their distances compare, and little about how far away all of them are.
+    """
+    nodes, bodies, of = particles.nodes, particles.nodes.bodies, _body_of(particles)
+    times, eye = bodies.nearest_to_ground(), bodies.eyes[bodies.row(nodes.curve.canonical_time)].clone()
+    bodies.enlarge(times, eye)
+    own, by = of >= 0, bodies.of_node >= 0
+    particles.means[own] = eye + times[of[own], None] * (particles.means[own] - eye)
+    particles.scales[own] += times[of[own], None].log()
+    nodes.positions[by] = eye + times[bodies.of_node[by], None] * (nodes.positions[by] - eye)
+    nodes.spacing[by] *= times[bodies.of_node[by]]
 
 
 def find(bodies: Bodies, time: float, positions: Tensor, image: Sight) -> Poses:

@@ -17,7 +17,7 @@ from forewarp.losses import IMAGE_LOSSES, robust
 from forewarp.methods.method import Method, Snapshot, Start, Step, value_at
 from forewarp.methods.particles import density, exposure
 from forewarp.methods.particles.contact import set_down
-from forewarp.methods.particles.follow import follow
+from forewarp.methods.particles.follow import follow, put_on_ground
 from forewarp.methods.particles.nodes import Nodes, Skinning, TimeOffsets, are_rows
 from forewarp.methods.particles.options import EFFECTS, SMALLEST, Effects, Numbers, view_share
 from forewarp.methods.particles.shared import begin_window, check_still, left_alone
@@ -427,6 +427,7 @@ class Particles(Method):
         """
         self.progress, stage = progress, self.stage
         if self.nodes is not None and self.nodes.led and progress >= stage.bodies:
+            put_on_ground(self)
             self.nodes.bodies.hand_over(self.nodes)
         density.bound_opacity(self)
         for group in optimizer.param_groups:
