@@ -66,7 +66,7 @@ def shown(nodes, truth, time):
             loss = off.square().sum()
             return torch.autograd.grad(loss, maps)[0], float(loss.detach())
 
-    return Sight(EYE, lambda places: [Look(compare, 200.0)] * 3)
+    return Sight(EYE, lambda places: [Look(compare, 200.0)] * 3, lambda row, going: going)
 
 
 def node_maps_of(nodes, poses):

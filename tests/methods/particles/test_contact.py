@@ -230,12 +230,19 @@ def test_a_body_is_seen_again_beside_where_it_was(led):
     assert torch.equal(_again(fine, frames, 0.9, row, Poses(turns, held)).middles, held)
 
 
+def test_what_rests_beside_a_body_is_not_of_it(led):
+    fine, _ = led
+    rests = fine.skinning.shares.sum(-1) == 0
+    fine.skinning.links[rests] = fine.skinning.links[_body_of(fine) == 0][:1]
+    assert bool(rests.any())
+    assert bool((_body_of(fine)[rests] == -1).all())
+
+
 def test_bodies_grow_until_they_touch_the_ground_and_images_stay_alike(led):
     fine, scene = led
     bodies, view, eye = fine.nodes.bodies, View(FRAME.camera), FRAME.camera.center.float()
     canonical, time = scene.canonical_time, next(t for t in sorted(fine.frames) if t != scene.canonical_time)
     row, far = bodies.row(time), (bodies.rest - eye).norm(dim=-1)
-    bodies.eyes[bodies.row(canonical)] = eye
     fine.opacity.data[_body_of(fine) < 0] = -20.0  # these would hide them
 
     def images():

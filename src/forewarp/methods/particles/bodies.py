@@ -195,8 +195,8 @@ class Bodies(nn.Module):
         """
         self.rest.copy_(eye + times[:, None] * (self.rest - eye))
         self.sizes.mul_(times)
-        moved = self.eyes + times[:, None, None] * (self.middles - self.eyes)
-        self.middles.copy_(torch.where(self.seen[:, None], moved, self.rest[:, None]))
+        gone = self.eyes + times[:, None, None] * (self.middles - self.eyes)
+        self.middles.copy_(torch.where(self.seen[:, None], gone, self.rest[:, None]))
 
     @torch.no_grad()
     def hand_over(self, nodes: Nodes) -> None:

@@ -17,7 +17,7 @@ from forewarp.methods.particles.start import first_values
 from forewarp.ops.grid import dilate
 from forewarp.scene.cloud import Cloud
 from forewarp.scene.frame import Frame, Scene, where_seen
-from forewarp.scene.view import Moment, View
+from forewarp.scene.view import Moment, Rendering, View
 
 if TYPE_CHECKING:
     from forewarp.methods.particles.model import Particles
@@ -61,7 +61,7 @@ def set_down(values: dict[str, Tensor], before: Particles, scene: Scene) -> dict
     moment = Moment(frame.time, camera=frame.camera_id, filmed=True)
     drawn = before.at(moment).render(View(camera), torch.zeros(3)).shaped(height, camera.width)
     means, moving = values["means"], frame.load_moving()
-    depth = torch.where(drawn.opacity > _SEEN, drawn.depth, 0.0)
+    depth = known_depth(drawn)
     if frame.load_valid is not None:
         depth[~frame.load_valid()] = 0.0
     step, edge = max(1, round(_STEP * height)), max(1, round(_EDGE * height))
@@ -95,6 +95,11 @@ def set_down(values: dict[str, Tensor], before: Particles, scene: Scene) -> dict
     kept["body_of"] = torch.cat([torch.full((len(kept["means"]) - count,), -1), of])
     kept["set_down"] = torch.arange(len(kept["means"])) >= len(kept["means"]) - count
     return kept
+
+
+def known_depth(drawn: Rendering) -> Tensor:
+    """Return the depth along rays of what is drawn, world units; 0 where it is less than half opaque."""
+    return torch.where(drawn.opacity > _SEEN, drawn.depth, 0.0)
 
 
 def things_on_the_ground(moving: Tensor, depth: Tensor) -> list[tuple[Tensor, float]]:

@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from forewarp.methods.particles.bodies import Bodies, Poses
-from forewarp.methods.particles.contact import things_on_the_ground
+from forewarp.methods.particles.contact import known_depth, things_on_the_ground
 from forewarp.ops.gaussians import Gaussians, Warp, moved
 from forewarp.ops.grid import dilate
 from forewarp.scene.camera import Camera
@@ -45,7 +45,6 @@ _REACH, _FASTER = 0.05, 1.5
 _FARTHEST_OFF, _ALIKE = 0.25, 0.3  # of that side, how far at most; the least correlation
 _FARTHEST = 3.0  # times the way between the two nearest images that a body may have gone on from the first
 _CELL = 0.05  # of an image's longer side: what lies within about one of a body is looked at with it
-_SEEN = 0.5  # opacity from which on the ground is known
 
 
 class Look(NamedTuple):
@@ -69,7 +68,7 @@ class Sight(NamedTuple):
 
     eye: Tensor
     looks: Callable[[Tensor], Sequence[Look]]
-    again: Callable[[int, Poses], Poses] = lambda row, going: going
+    again: Callable[[int, Poses], Poses]
 
 
 @torch.no_grad()
@@ -88,7 +87,7 @@ def follow(particles: Particles, seen: Observation, frames: Mapping[float, Frame
     row, number = bodies.row(time), int(_ROUNDS * particles.progress / particles.stage.bodies)
     known, late = bool(bodies.seen[row]), int(bodies.rounds[row]) < number
     late &= row != bodies.row(nodes.curve.canonical_time)  # there they are where they were set down
-    bodies.rounds[row], bodies.eyes[row] = number, camera.center
+    bodies.rounds[row] = number
     if known:
         if late:
             _refit(particles, seen)
@@ -112,7 +111,9 @@ def put_on_ground(particles: Particles) -> None:
     how their distances compare, and little about how far away all of them are.
     """
     nodes, bodies, of = particles.nodes, particles.nodes.bodies, _body_of(particles)
-    times, eye = bodies.nearest_to_ground(), bodies.eyes[bodies.row(nodes.curve.canonical_time)].clone()
+    canonical = bodies.row(nodes.curve.canonical_time)
+    eye = _frame_at(particles.frames, bodies.times[canonical]).camera.center.to(bodies.eyes)
+    times, bodies.eyes[canonical] = bodies.nearest_to_ground(), eye
     bodies.enlarge(times, eye)
     own, by = of >= 0, bodies.of_node >= 0
     particles.means[own] = eye + times[of[own], None] * (particles.means[own] - eye)
@@ -137,16 +138,11 @@ def find(bodies: Bodies, time: float, positions: Tensor, image: Sight) -> Poses:
     resting = Poses(going.turns, held.middles)
     again = image.again(near, going)
 
-    motion, maps = positions.new_zeros(len(positions), 7), positions.new_zeros(len(positions), 12)
-    places = []
-    for way in (going, resting, again):
-        bodies.carry(way, positions, motion, maps)
-        places.append((positions + motion[:, :3])[bodies.of_node >= 0])
+    places = [_carried(bodies, way, positions)[0] for way in (going, resting, again)]
     first, *looks = image.looks(torch.cat(places))
 
     def compared(look: Look, poses: Poses) -> tuple[Tensor, float]:
-        bodies.carry(poses, positions, motion, maps)
-        by_maps, loss = look.compare(maps)
+        by_maps, loss = look.compare(_carried(bodies, poses, positions)[1])
         return bodies.by_twists(poses, by_maps), loss
 
     start, least = going, compared(first, going)[1]
@@ -187,19 +183,23 @@ def fit_distances(poses: Poses, eye: Tensor, compared: Callable[[Poses], float])
 
 def _refit(particles: Particles, seen: Observation) -> None:
     """Fit distances of bodies to an image in which they were found."""
-    nodes, time, eye = particles.nodes, seen.moment.time, seen.view.camera.center
-    bodies, positions = nodes.bodies, nodes.positions
-    motion, maps = positions.new_zeros(len(positions), 7), positions.new_zeros(len(positions), 12)
-    poses, eye = bodies.at(time), eye.to(positions)
-    bodies.carry(poses, positions, motion, maps)
-    places = (positions + motion[:, :3])[bodies.of_node >= 0]
-    (look,) = _looks(particles, seen, places, _SIDES[-1:])
+    bodies, positions, time = particles.nodes.bodies, particles.nodes.positions, seen.moment.time
+    poses, eye = bodies.at(time), seen.view.camera.center.to(positions)
+    (look,) = _looks(particles, seen, _carried(bodies, poses, positions)[0], _SIDES[-1:])
 
     def compared(poses: Poses) -> float:
-        bodies.carry(poses, positions, motion, maps)
-        return look.compare(maps)[1]
+        return look.compare(_carried(bodies, poses, positions)[1])[1]
 
     bodies.put(time, fit_distances(poses, eye, compared), eye)
+
+
+def _carried(bodies: Bodies, poses: Poses, positions: Tensor) -> tuple[Tensor, Tensor]:
+    """Return where poses take the nodes (P, 3) of bodies, and the maps (M, 12) of all nodes, at rest at
+    ``positions`` (M, 3).
+    """
+    motion, maps = positions.new_zeros(len(positions), 7), positions.new_zeros(len(positions), 12)
+    bodies.carry(poses, positions, motion, maps)
+    return (positions + motion[:, :3])[bodies.of_node >= 0], maps
 
 
 def _slid(bodies: Bodies, poses: Poses, eye: Tensor, look: Look, compared: Callable) -> Poses:
@@ -302,8 +302,7 @@ def _again(particles: Particles, frames: Mapping[float, Frame], time: float, row
     """
     bodies = particles.nodes.bodies
     held = Poses(bodies.turns[:, row], bodies.middles[:, row])
-    nearest_time = min(frames, key=lambda other: abs(other - bodies.times[row]))
-    (image, camera), (other, after) = _small(frames[nearest_time]), _small(frames[time])
+    (image, camera), (other, after) = _small(_frame_at(frames, bodies.times[row])), _small(frames[time])
     of, eye, found = _body_of(particles), after.center.to(held.middles), Poses(going.turns, held.middles)
     was, here, there = (
         view.project(middles)[0].cpu()
@@ -330,6 +329,11 @@ def _body_of(particles: Particles) -> Tensor:
     skinning = particles.skinning
     of = particles.nodes.bodies.of_node[skinning.links[:, 0].long()]
     return of.where(skinning.shares.sum(-1) > 0, -1)
+
+
+def _frame_at(frames: Mapping[float, Frame], time: float) -> Frame:
+    """Return the frame nearest to a time."""
+    return frames[min(frames, key=lambda other: abs(other - time))]
 
 
 def _small(frame: Frame) -> tuple[Tensor, Camera]:
@@ -394,7 +398,7 @@ def _farthest(particles: Particles, seen: Observation, moving: Tensor | None) ->
     still = Warp(whole.warp.maps, whole.warp.links[rests], whole.warp.weights[rests])
     part = replace(whole, gaussians=Gaussians(*(values[rests] for values in whole.gaussians)), warp=still)
     drawn = part.render(View(camera), torch.zeros(3, device=rests.device)).shaped(*size)
-    depth = torch.where(drawn.opacity > _SEEN, drawn.depth, 0.0).cpu()
+    depth = known_depth(drawn).cpu()
     row, column, shown = where_seen(camera, moved(particles.means, whole.warp)[0])
     of = _body_of(particles)
     own = [shown & (of == body) for body in range(len(bodies))]
