@@ -54,7 +54,7 @@ def test_the_page_has_scenes_by_minutes_and_keeps_what_was_measured_before(tmp_p
         write_psnr(folder, 30, 31, 34, 33, 32)
     page, table, picture = write_minutes(runs, out)
     assert (page.name, table.name, picture.name) == ("forward.md", "forward.csv", "forward.png")
-    assert rows_of(page.read_text(), "ball")[0] == ["ball", "31.00 ± 1.41"]
+    assert rows_of(page.read_text(), "ball")[0] == ["ball", "31.00 (30.00, 32.00)"]
     assert all("/home/me" not in file.read_text() for file in (page, table))
     assert "paths.scenes=DATASETS" in page.read_text()
     later = tmp_path / "later"
@@ -63,10 +63,10 @@ def test_the_page_has_scenes_by_minutes_and_keeps_what_was_measured_before(tmp_p
     write_run(later, seed=0, psnr=20.0, scene="hook", metrics=TOY)
     write_run(later, scene="endless", minutes=None)
     text = write_minutes(later, out)[0].read_text()
-    assert rows_of(text, "ball")[0] == ["ball", "31.50 ± 2.12", "40.00"]
+    assert rows_of(text, "ball")[0] == ["ball", "31.50 (30.00, 33.00)", "40.00"]
     assert rows_of(text, "mean of toy") == [["mean of toy", "25.75", ""]]  # no hook of five minutes
     (details,) = [row for row in rows_of(section(text, "Each"), "ball") if row[1] == "1"]
-    assert details[2:5] == ["2", "31.50 ± 2.12", "0.9000 ± 0.0000"]
+    assert details[2:5] == ["2", "31.50 (30.00, 33.00)", "0.9000 (0.9000, 0.9000)"]
     assert details[6] == "2.5"  # dB at the ends
     assert "* endless/base-None-seed0: no budget.minutes" in text
     rows = list(csv.DictReader(table.read_text().splitlines()))
@@ -98,7 +98,7 @@ def test_rows_of_earlier_versions_stay(tmp_path):
 
 def test_methods_are_compared_after_equal_minutes(tmp_path):
     runs = tmp_path / "runs"
-    for seed in (0, 1):
+    for seed in (0, 1, 2):
         own = {"test": {"all": {"psnr": 32 + seed, "ssim": 0.95, "lpips_vgg": 0.1}}}
         other = {"test": {"all": {"psnr": 30, "ssim": 0.96, "lpips_vgg": 0.2}}}
         write_run(runs, "p", seed, metrics={**TOY, **own}, **PARTICLES)
@@ -107,9 +107,11 @@ def test_methods_are_compared_after_equal_minutes(tmp_path):
     write_run(runs, "w", 3, metrics={"protocol": {"threads": 1}})
     pages = pages_of(write_minutes(runs, tmp_path / "out"))
     (row,) = rows_of(section(pages["particles.md"], "Beside `forward`"), "ball")
-    assert row[1:5] == ["1", "2 and 2", "32.50 ± 0.71", "30.00 ± 0.00"]
-    assert row[5:] == ["above by 2.50 dB", "below by 0.0100", "better by 0.1000"]
-    assert "below by 2.50 dB" in section(pages["forward.md"], "Beside `particles`")
+    assert row[1:5] == ["1", "3 and 3", "33.00 ± 2.48", "30.00 ± 0.00"]  # 4.303 / sqrt(3) = 2.484
+    assert row[5:] == ["+3.00 ± 2.48 dB, above", "-0.0100 ± 0.0000, below", "-0.1000 ± 0.0000, better"]
+    beside = section(pages["forward.md"], "Beside `particles`")
+    assert "-3.00 ± 2.48 dB, below" in beside
+    assert "3 differences are of three seeds or more; by chance 0.15 of their intervals" in beside
 
 
 def test_kinds_of_views_and_moving_points_stand_beside_each_other(tmp_path):
@@ -124,7 +126,7 @@ def test_kinds_of_views_and_moving_points_stand_beside_each_other(tmp_path):
     assert rows_of(section(text, "Space, time, motion"), "ball")[0][3:-1] == ["1", "30.00", "31.00", "32.00"]
 
 
-def test_more_minutes_and_more_particles_hold_or_fall(tmp_path):
+def test_more_minutes_and_more_particles_are_compared_with_fewer(tmp_path):
     runs = tmp_path / "runs"
     for length, psnr in ((1.0, 30.0), (5.0, 31.0), (20.0, 30.7)):
         write_run(runs, psnr=psnr, minutes=length, metrics={**TOY, "size": {"particles": 12000}}, **PARTICLES)
@@ -135,13 +137,13 @@ def test_more_minutes_and_more_particles_hold_or_fall(tmp_path):
     text = write_minutes(runs, tmp_path / "out")[0].read_text()
     assert rows_of(text, "ball")[0] == ["ball", "30.00", "31.00", "30.70"]  # of the preset's density alone
     told = [row[-1] for row in rows_of(section(text, "More minutes"), "ball")]
-    assert told == ["", "holds (+1.00 dB)", "falls by 0.30 dB"]
+    assert told == ["", "+1.00 dB", "-0.30 dB"]
     assert [row[1] for row in rows_of(section(text, "Each"), "ball")] == ["1", "5", "20"]
     found = [(*row[3:6], row[-1]) for row in rows_of(section(text, "More particles"), "ball")]
     assert found == [
         ("45", "6000", "29.90", ""),
-        ("", "12000", "30.00", "holds (+0.10 dB)"),
-        ("180", "24000", "29.85", "holds (-0.15 dB)"),
+        ("", "12000", "30.00", "+0.10 dB"),
+        ("180", "24000", "29.85", "-0.15 dB"),
     ]
 
 
@@ -154,7 +156,7 @@ def test_larger_pictures_are_compared_at_the_size_of_small_ones(tmp_path):
     assert rows_of(text, "ball")[0] == ["ball", "33.00"]
     large, small = rows_of(section(text, "Larger images"), "ball")
     assert large[3:5] == ["800x800 reduced 2x2, background white", "33.40"]
-    assert large[-1] == "above by 0.40 dB the run that learned from 400x400"
+    assert large[-1] == "+0.40 dB, to the run that learned from 400x400"
     assert small[3:5] == ["400x400, background white", "33.00"]
     assert "Beside" not in text
 
@@ -197,7 +199,7 @@ def test_methods_are_compared_over_lengths(tmp_path, monkeypatch):
     written = write_minutes(tmp_path / "later", out, tmp_path / "others.yaml")
     text = pages_of(written)["accuracy-time.md"]
     assert rows_of(text, "method")[0][1:] == ["2 s", "1 min", "5 min", "seeds", "passed by `particles` after"]
-    assert rows_of(text, "`particles`")[0][1:] == ["21.00 ± 1.41", "30.00", "33.00", "2, 1, 1", ""]
+    assert rows_of(text, "`particles`")[0][1:] == ["21.00 (20.00, 22.00)", "30.00", "33.00", "2, 1, 1", ""]
     assert rows_of(text, "`forward`")[0][1:] == ["19.00", "24.00", "29.50", "1, 1, 1", "1 min"]
     assert "| Other | 31 | 600 s | RTX 1 | dnerf | its paper |" in text
     assert ("Toy" in text, beside) == (False, [[OTHER]])  # of no scene's dataset
@@ -275,7 +277,13 @@ def test_methods_are_ranked_and_what_they_depart_from_is_listed_once(tmp_path, m
     text = page.read_text()
     first = [line.split("|")[1].strip() for line in text.splitlines() if line.startswith("| `")]
     assert first == ["`particles`", "`forward` (the paper's)", "`ndvg`", "`tnerf`"]
-    assert rows_of(text, "`particles`")[0][1:6] == ["2", "31.00 ± 1.41", "0.9000 ± 0.0000", "", "100"]
+    assert rows_of(text, "`particles`")[0][1:6] == [
+        "2",
+        "31.00 (30.00, 32.00)",
+        "0.9000 (0.9000, 0.9000)",
+        "",
+        "100",
+    ]
     assert rows_of(text, "rays of one picture") == [["rays of one picture", "`ndvg`, `tnerf`"]]
     assert rows_of(text, "kept fault: padded") == [["kept fault: padded", "`ndvg`"]]
     assert "**ball, 5 minutes, 5 of 20 test views, evenly spread**" in text
@@ -290,6 +298,16 @@ def test_methods_are_ranked_and_what_they_depart_from_is_listed_once(tmp_path, m
         reds = [red for _, (red, green, _) in picture.convert("RGB").getcolors() if green < 8]
     for psnr, there in ((27, True), (30, True), (22, True), (21, False)):
         assert any(abs(red - 7 * psnr) < 4 for red in reds) == there, psnr  # tnerf has no sheets
+
+
+def test_methods_that_cannot_be_told_apart_share_the_mark_of_the_best(tmp_path):
+    found = {"forward": (30.0, 30.1, 30.2), "particles": (30.1, 30.0, 30.2), "ndvg": (20.0, 20.1, 20.2)}
+    for name, psnr in (found | {"tnerf": (40.0,)}).items():  # one seed, however good, is not ranked
+        for seed, value in enumerate(psnr):
+            method_run(tmp_path / "runs", name, value, seed=seed)
+    text = write_methods(tmp_path / "runs", tmp_path / "out")[0].read_text()
+    names = ("`forward` (the paper's)", "`particles`", "`ndvg`", "`tnerf`")
+    assert [rows_of(text, name)[0][2].startswith("**") for name in names] == [True, True, False, False]
 
 
 def test_later_runs_are_added_and_runs_under_other_conditions_have_their_own_table(tmp_path):
@@ -353,7 +371,7 @@ def test_a_metric_that_was_added_has_a_column_and_stays_in_the_table(tmp_path, m
     text = pages_of(write_minutes(runs, out))["particles.md"]
     assert rows_of(section(text, "Each"), "scene")[0][6] == "Mean error"
     assert rows_of(section(text, "Each"), "ball")[0][6] == "0.125"
-    assert rows_of(section(text, "Beside `forward`"), "ball")[0][-1] == "better by 0.125"
+    assert rows_of(section(text, "Beside `forward`"), "ball")[0][-1] == "-0.125"
     assert rows_of(write_methods(runs, out)[0].read_text(), "`forward` (the paper's)")[0][5] == "0.250"
     write_run(tmp_path / "later", scene="hook", config={"model": {"name": "forward"}})
     text = pages_of(write_minutes(tmp_path / "later", out))["forward.md"]

@@ -36,14 +36,25 @@ def test_each_decibel_names_the_first_to_reach_it_in_all_seeds(tmp_path):
     write_run(runs, "lucky", 1, curve=((90, 26.0), (99, 26.0)))
     page, picture, table = write_accuracy_time(runs, tmp_path / "out")
     text = page.read_text()
-    assert rows_of(text, "24") == [["24", "10.0 ± 0.0", "base", "`forewarp-train variant=base seed=0`"]]
-    assert rows_of(text, "25")[0][1:3] == ["25.0 ± 7.1", "base"]
+    assert rows_of(text, "24") == [
+        ["24", "10.0 (10.0, 10.0)", "base", "`forewarp-train variant=base seed=0`"]
+    ]
+    assert rows_of(text, "25")[0][1:3] == ["25.0 (20.0, 30.0)", "base"]
     assert rows_of(text, "26")[0][1:3] == rows_of(text, "27")[0][1:3] == ["35.0", "good"]
     assert rows_of(text, "28") == []
     assert "seconds to 25 dB" in text  # what the base reaches
-    assert rows_of(text, "base")[0][1:] == ["1", "2", "25.0 ± 7.1", "25.50 ± 0.00", "", "100 ± 0"]
+    assert rows_of(text, "base")[0][1:] == [
+        "1",
+        "2",
+        "25.0 (20.0, 30.0)",
+        "25.50 (25.50, 25.50)",
+        "",
+        "100 (100, 100)",
+    ]
     csv = table.read_text().splitlines()
-    assert csv[0].startswith("variant,minutes,seeds,seconds to 25 dB,seconds to 25 dB sd,PSNR")
+    assert csv[0].startswith(
+        "variant,minutes,seeds,seconds to 25 dB,seconds to 25 dB ci95,seconds to 25 dB n,PSNR"
+    )
     assert (len(csv), picture.name) == (4, "accuracy-time-ball.png")
 
 
@@ -81,20 +92,25 @@ def test_changes_are_against_the_same_seed(tmp_path):
     runs = tmp_path / "runs"
     write_run(runs, "base", 0, psnr=30.0, epe=0.2)
     write_run(runs, "base", 1, psnr=28.0, epe=0.2)
+    write_run(runs, "base", 2, psnr=29.0, epe=0.2)
     write_run(runs, "grid_64", 0, psnr=29.0, steps=200, epe=0.1)
     write_run(runs, "grid_64", 1, psnr=27.5, steps=200, epe=0.1)
+    write_run(runs, "grid_64", 2, psnr=28.25, steps=200, epe=0.1)
     write_run(runs, "unet_16", 0, psnr=30.5, steps=50, against="grid_64")
     # Named by what was typed; what all of them share is no part of their names.
-    write_run(runs, "data.box=null", 2, psnr=20.0, against=None)
-    write_run(runs, "data.box=null preset.rays=64", 2, psnr=21.0, against=None)
-    write_run(runs, "data.box=null model=backward preset.rays=64", 2, psnr=21.5, against=None)
+    write_run(runs, "data.box=null", 4, psnr=20.0, against=None)
+    write_run(runs, "data.box=null preset.rays=64", 4, psnr=21.0, against=None)
+    write_run(runs, "data.box=null model=backward preset.rays=64", 4, psnr=21.5, against=None)
     write_run(runs, "alone", 5)
     write_run(runs, "failed", psnr=None)
     page, file = write_price_list(runs, tmp_path / "out")
     text = page.read_text()
     own, change = rows_of(text, "grid_64")
-    assert own[1:3] == ["2", "28.25 ± 1.06"]
-    assert change[1:5] == ["base", "2", "-0.75 ± 0.35", "+0.0000 ± 0.0000"]
+    # Deviations of 0.75 and, of the changes -1.0, -0.5 and -0.75, of 0.25; times 4.303 / sqrt(3).
+    assert own[1:3] == ["3", "28.25 ± 1.86"]
+    assert change[1:5] == ["base", "3", "-0.75 ± 0.62", "+0.0000 ± 0.0000"]
+    # PSNR, SSIM and EPE; the other changes are of one seed.
+    assert "3 differences are of three seeds or more; by chance 0.15 of their intervals" in text
     assert change[5:] == ["-0.1000 ± 0.0000", "×0.50 ± 0.00", *["×1.00 ± 0.00"] * 3, "×2.00 ± 0.00"]
     assert rows_of(text, "unet_16")[0][1:6] == ["grid_64", "1", "+1.50", "+0.0000", ""]
     assert rows_of(text, "preset.rays=64")[1][1:4] == ["base", "1", "+1.00"]
@@ -105,7 +121,7 @@ def test_changes_are_against_the_same_seed(tmp_path):
     assert "* ball/failed-1.0-seed0: no metrics.json" in text
     lines = file.read_text().splitlines()
     assert lines[0].startswith("scene,variant,minutes,seed,views,PSNR (dB),SSIM,EPE,s/step,")
-    assert len(lines) == 10
+    assert len(lines) == 12
 
 
 def test_scenes_and_minutes_stand_apart_and_the_page_is_named_after_most_runs(tmp_path):
@@ -132,7 +148,7 @@ def write_choice(root, choice, *, scene="ball", seed=0, on=(), psnr=30.0, model=
 
 
 def test_the_page_of_effects_compares_with_the_best_and_says_why(tmp_path):
-    for seed, gain in ((0, 0.9), (1, 1.1)):
+    for seed, gain in ((0, 0.9), (1, 1.1), (2, 1.0)):
         write_choice(tmp_path / "runs", "auto", seed=seed, on=["motion"], psnr=31.0 + gain)
         write_choice(tmp_path / "runs", "base", seed=seed, psnr=31.0)
         write_choice(tmp_path / "runs", "no_effects", seed=seed, psnr=20.0)
@@ -144,11 +160,11 @@ def test_the_page_of_effects_compares_with_the_best_and_says_why(tmp_path):
     assert others[0].read_text().startswith("# Only the effects a scene calls for: model=particles")
     text = page.read_text()
     (ball,), (hook,) = (rows_of(text.partition("## Why")[0], name) for name in ("ball", "hook"))
-    assert ball[3:5] == ["32.00 ± 0.14", "31.00 ± 0.00"]
-    assert ball[-3:] == ["+1.00 ± 0.14", "above, the preset", "12.5 ± 0.0"]
+    assert ball[3:5] == ["32.00 ± 0.25", "31.00 ± 0.00"]
+    assert ball[-3:] == ["+1.00 ± 0.25", "above, the preset", "12.5 ± 0.0"]
     assert hook[-3:] == ["-1.00", "one seed, every effect", "12.5"]
     assert ["hook", "view", "x", "view, 3 %"] in rows_of(text.partition("## Why")[2], "hook")
-    assert len(table.read_text().splitlines()) == 9
+    assert len(table.read_text().splitlines()) == 12
 
 
 def test_seeds_are_paired_and_what_is_missing_is_empty(tmp_path):

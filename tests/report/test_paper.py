@@ -5,6 +5,7 @@ import json
 import os
 import re
 import sys
+from itertools import product
 
 import imageio.v3 as iio
 import numpy as np
@@ -80,12 +81,14 @@ def test_no_mean_is_taken_over_unlike_images(tmp_path, protocol):
     assert cells(table_of(tmp_path, "dnerf_scenes"))[6] == "30.00"
 
 
-def test_seeds_give_a_deviation_where_all_scenes_have_them(tmp_path):
-    for seed, psnr in ((0, 20.0), (1, 22.0)):
+def test_seeds_give_an_interval_where_all_scenes_have_them(tmp_path):
+    for seed, psnr in ((0, 20.0), (1, 22.0), (2, 21.0)):
         for scene in ALL:
             paper_run(tmp_path, scene, seed=seed, psnr=psnr)
-    paper_run(tmp_path, "hook", seed=2, psnr=99.0)
-    assert cells(table_of(tmp_path), f"{OURS}, 3 seeds")[0] == "21.00 ± 1.41"
+    paper_run(tmp_path, "hook", seed=3, psnr=99.0)
+    table = table_of(tmp_path)
+    assert cells(table, f"{OURS}, 4 seeds")[0] == "21.00 ± 2.48"  # 4.303 / sqrt(3)
+    assert "95 % confidence interval of a mean (Student's t over the seeds)" in table.caption
 
 
 def test_some_training_views_neither_replace_nor_join_all_of_them(tmp_path):
@@ -96,19 +99,19 @@ def test_some_training_views_neither_replace_nor_join_all_of_them(tmp_path):
     write_paper(tmp_path, tmp_path / "out")
     text = re.sub(" +", " ", (tmp_path / "out" / "paper.md").read_text())
     assert f"| {OURS} | 30.00 |" in text
-    assert f"| {OURS}, 2 seeds, 16 training views | 20.00 ± 0.00 |" in text
+    assert f"| {OURS}, 2 seeds, 16 training views | 20.00 (20.00, 20.00) |" in text
     assert "is newer" not in text
 
 
 def test_ranks_are_among_measured_rows_alone(tmp_path):
     for variant, psnr, lpips in (("full", 25.0, 0.2), ("no_tv", 24.0, 0.1), ("no_view", 20.0, 0.3)):
-        for scene in ALL[:4]:
-            paper_run(tmp_path, scene, variant, psnr=psnr, lpips_vgg=lpips)
+        for scene, seed in product(ALL[:4], range(3)):
+            paper_run(tmp_path, scene, variant, seed, psnr=psnr, lpips_vgg=lpips)
     table = table_of(tmp_path, "losses")
     names = [f"forewarp: the {variant}" for variant in ("full", "no_tv", "no_view")]
-    assert cells(table, names[0]) == ["**25.00**", "**0.900**", "<u>0.200</u>"]
-    assert cells(table, names[1]) == ["<u>24.00</u>", "**0.900**", "**0.100**"]
-    assert cells(table, names[2])[::2] == ["20.00", "0.300"]
+    assert cells(table, names[0]) == ["**25.00 ± 0.00**", "**0.900 ± 0.000**", "<u>0.200 ± 0.000</u>"]
+    assert cells(table, names[1]) == ["<u>24.00 ± 0.00</u>", "**0.900 ± 0.000**", "**0.100 ± 0.000**"]
+    assert cells(table, names[2])[::2] == ["20.00 ± 0.00", "0.300 ± 0.000"]
     assert cells(table, kind="published") == ["33.75", "0.979", "0.040"]  # as printed, unmarked
     assert cells(table, kind="difference to the paper") == ["-8.75", "-0.079", "+0.160"]
     # Each published row has its measured one below it.
@@ -117,6 +120,16 @@ def test_ranks_are_among_measured_rows_alone(tmp_path):
     assert table.rules == [3, 6, 10, 13]
     assert table.texts()[1][-len(COSTS) :] == ["50", "1.00", "2.000", "100", "1", "a cpu, 2 threads"]
     assert table.rows[0][-len(COSTS) :] == [None] * len(COSTS)
+
+
+def test_rows_that_cannot_be_told_apart_share_the_mark(tmp_path):
+    # 30.07 ± 0.12 and 30.04 ± 0.20 (deviations of 0.05 and 0.08): by rounding, the first alone was marked.
+    for variant, psnr in (("full", (30.02, 30.07, 30.12)), ("no_tv", (30.12, 29.96, 30.04))):
+        for scene, seed in product(ALL[:4], range(3)):
+            paper_run(tmp_path, scene, variant, seed, psnr=psnr[seed])
+    table = table_of(tmp_path, "losses")
+    shown = [cells(table, f"forewarp: the {variant}")[0] for variant in ("full", "no_tv")]
+    assert shown == ["**30.07 ± 0.12**", "**30.04 ± 0.20**"]
 
 
 def test_abilities_and_depth_have_columns_of_their_own(tmp_path):
@@ -174,7 +187,7 @@ def test_pages_tell_how_numbers_came_about(whole):
     assert [kind for kind, _ in sources] == ["data:image/png;base64"] * 5
     assert all(base64.b64decode(content).startswith(b"\x89PNG") for _, content in sources)
     assert not re.search(r"https?://|<script|<link", page)
-    assert "<b>30.00</b>" in page or "<u>30.00</u>" in page or "<td class=n>30.00" in page
+    assert "<td class=n>30.00" in page
     latex = (whole / "paper.tex").read_text()
     escaped = r"2026-11-25, a\_b\textasciicircum{}c: $-$2.5 \& \$$\pm$"
     assert latex_text("2026-11-25, a_b^c: -2.5 & $±") == escaped
@@ -183,7 +196,6 @@ def test_pages_tell_how_numbers_came_about(whole):
     assert r"\caption{D-NeRF, mean of eight scenes (table 1 of the paper)}" in latex
     for name in ("table", "tabular", "document"):
         assert latex.count(rf"\begin{{{name}}}") == latex.count(rf"\end{{{name}}}") > 0
-    assert r"\underline{" in latex or r"\textbf{" in latex
     assert r"\footnotesize machine: a cpu, 2 threads, torch 2" in latex
 
 
@@ -313,12 +325,13 @@ def test_every_system_stands_beside_its_published_row(tmp_path, dataset):
 def test_rows_of_other_views_or_another_clock_stand_apart(tmp_path):
     few = {"measured": "5 of 20 test views, evenly spread"}
     for seed, protocol in enumerate(({}, few)):
-        for model in ("particles", "forward"):
-            paper_run(tmp_path / str(seed), "toy", warp=model, made=True, protocol=protocol)
+        for model, again in product(("particles", "forward"), range(3)):
+            paper_run(tmp_path / str(seed), "toy", warp=model, seed=again, made=True, protocol=protocol)
     table = read_paper(PAPER)["dnerf"]
     both, one = (stand_in(table, read_runs(folder)[0]) for folder in (tmp_path, tmp_path / "1"))
     names = [row[0] for row in both.rows]
-    assert names[:3] == [OURS, f"{OURS}, 5 test views", "forewarp: particles, fast, 1 min"]
+    assert names[:2] == [f"{OURS}, 3 seeds", f"{OURS}, 3 seeds, 5 test views"]
+    assert names[2] == "forewarp: particles, fast, 1 min, 3 seeds"
     assert [bool(shown.marks) for shown in (both, one)] == [False, True]
     old = paper_run(tmp_path / "2", "toy", made=True, protocol={"clock": "processor"})
     os.utime(old / "metrics.json", (1, 1))
@@ -336,9 +349,9 @@ def test_rows_of_other_views_or_another_clock_stand_apart(tmp_path):
     [({}, True), ({"threads": 1}, False), ({"clock": "processor"}, False), ({"device": "a gpu"}, False)],
 )
 def test_rows_of_other_conditions_are_not_ranked(tmp_path, change, marked):
-    for scene in ALL:
-        paper_run(tmp_path, scene, psnr=31.0)
-        paper_run(tmp_path, scene, warp="backward", psnr=30.0, protocol=change)
+    for scene, seed in product(ALL, range(3)):
+        paper_run(tmp_path, scene, seed=seed, psnr=31.0)
+        paper_run(tmp_path, scene, seed=seed, warp="backward", psnr=30.0, protocol=change)
     assert bool(table_of(tmp_path).marks) is marked
 
 
@@ -394,9 +407,9 @@ def page_of(root):
 
 def test_the_page_says_which_of_the_papers_orders_hold(tmp_path):
     # Printed in table 5: no coarse stage -2.12, middle +0.34, flow L1 -0.01, total variation -0.45.
-    changes = {"no_coarse": (-1.0, -1.2), "canonical_middle": (-0.4, -0.4), "no_flow": (0.1, -0.1)}
-    changes["no_tv"] = (1, 1.1)
-    for seed, whole in enumerate((25.0, 26.0)):
+    changes = {"no_coarse": (-1.0, -1.2, -1.1), "canonical_middle": (-0.4, -0.4, -0.4)}
+    changes |= {"no_flow": (0.1, -0.1, 0.0), "no_tv": (1, 1.1, 1.2)}
+    for seed, whole in enumerate((25.0, 26.0, 27.0)):
         part(tmp_path, "full", seed, whole)
         part(tmp_path, "full", seed, whole - 5, steps=600)
         for variant, change in changes.items():
@@ -406,22 +419,21 @@ def test_the_page_says_which_of_the_papers_orders_hold(tmp_path):
     assert rows_of(text.split("## Table 5")[0], "4 min") == [["4 min", "5", "2", "1", "2", "0"]]
     section = text.split("## Table 5")[1].split("## ")[0]
     ours, no_tv, no_flow = (rows_of(section, n)[0] for n in ("Ours", "w/o total variation", "w/o flow L1"))
-    assert ours[1:6] == ["", "25.50 ± 0.71", "", "", "0.500"]
-    assert ours[6:] == ["×1.00", "20.50 ± 0.71", "", "", "0.083", "×1.00"]
-    assert no_tv[1:7] == ["-0.45", "26.55 ± 0.78", "+1.05 ± 0.07", "reversed", "0.250", "×0.50"]
-    assert no_tv[7:10] == ["19.50 ± 0.71", "-1.00 ± 0.00", "holds"]
-    assert no_flow[1:7] == ["-0.01", "25.50 ± 0.57", "+0.00 ± 0.14", "within noise", "0.250", "×0.50"]
+    # Deviations of 1.0, 1.1 and 0.1, times 4.303 / sqrt(3) = 2.484.
+    assert ours[1:6] == ["", "26.00 ± 2.48", "", "", "0.500"]
+    assert ours[6:] == ["×1.00", "21.00 ± 2.48", "", "", "0.083", "×1.00"]
+    assert no_tv[1:7] == ["-0.45", "27.10 ± 2.73", "+1.10 ± 0.25", "reversed", "0.250", "×0.50"]
+    assert no_tv[7:10] == ["20.00 ± 2.48", "-1.00 ± 0.00", "holds"]
+    assert no_flow[1:2] + no_flow[3:7] == ["-0.01", "+0.00 ± 0.25", "no difference shown", "0.250", "×0.50"]
     assert no_flow[7:] == [""] * 5
-    assert rows_of(section, "w/o coarse stage")[0][3:5] == ["-1.10 ± 0.14", "holds"]
+    assert rows_of(section, "w/o coarse stage")[0][3:5] == ["-1.10 ± 0.25", "holds"]
     assert rows_of(section, "canonical time in the middle")[0][3:5] == ["-0.40 ± 0.00", "reversed"]
     assert not rows_of(section, "w/o view direction")  # nobody ran it
-    # Both deviations of 0.14 and one of 0.07 and of 0: the root of the mean of their squares.
-    assert "4 min, 2 seeds: noise 0.11 dB; 600 steps, 2 seeds: noise 0.00 dB." in section
+    assert "4 min, 3 seeds; 600 steps, 3 seeds." in section
     assert "budget: fast, 4 min a run by the processor clock; fast, 600 steps" in text
-    other = text.split("## Table 6: modules: vehicle")[1]  # has one of these rows, and the same noise
-    assert "4 min, 2 seeds: noise 0.11 dB" in other
+    other = text.split("## Table 6: modules: vehicle")[1]  # has one of these rows
     assert not rows_of(other, "w/o coarse stage")
-    assert len(table.splitlines()) == 1 + 2 * 7
+    assert len(table.splitlines()) == 1 + 3 * 7
 
 
 def test_runs_at_rest_stand_above_what_the_page_has_already(tmp_path):
@@ -436,6 +448,7 @@ def test_runs_at_rest_stand_above_what_the_page_has_already(tmp_path):
     for seed in range(2):
         part(tmp_path / "first", "full", seed, 25.0)
         part(tmp_path / "first", "no_tv", seed, 24.0)
+    for seed in range(3):
         rest("full", seed, 23.0 + seed)
         rest("no_inpainter", seed, 22.5 + seed)
         rest("base", seed, 24.0 + seed, "backward")
@@ -452,23 +465,27 @@ def test_runs_at_rest_stand_above_what_the_page_has_already(tmp_path):
         assert text[text.index("## In short") :] == before[before.index("## In short") :]
     section = text.split("## At rest")[1].split("## ")[0]
     ours, without, backward = rows_of(section, "vehicle")
-    assert ours[1:6] == ["Ours", "", "23.50 ± 0.71", "", ""]
-    assert without[2:6] == ["-0.90", "23.00 ± 0.71", "-0.50 ± 0.00", "holds"]
+    assert ours[1:6] == ["Ours", "", "24.00 ± 2.48", "", ""]
+    assert without[2:6] == ["-0.90", "23.50 ± 2.48", "-0.50 ± 0.00", "holds"]
     assert without[6:8] == ["20.00 ± 0.00", "+0.10 ± 0.00"]
-    assert backward[2:6] == ["", "24.50 ± 0.71", "+1.00 ± 0.00", ""]
-    assert "vehicle 0.00 dB" in section
+    assert backward[2:6] == ["", "25.00 ± 2.48", "+1.00 ± 0.00", ""]
+    assert "2 differences are of three seeds or more" in section
     write_ablation(tmp_path / "first", out)  # the others anew
     assert (out / "ablation.md").read_text() == text
 
 
 def test_a_row_with_fewer_seeds_says_so(tmp_path):
-    for seed, whole in enumerate((25.0, 26.0)):
+    for seed, whole in enumerate((25.0, 26.0, 27.0, 28.0)):
         part(tmp_path, "full", seed, whole)
         part(tmp_path, "no_flow", seed, whole + 0.1 * seed)
     part(tmp_path, "no_tv", 1, 24.0)
+    for seed in range(3):
+        part(tmp_path, "no_coarse", seed, 24.0 + seed)
     rows = page_of(tmp_path)[0].split("## Table 5")[1]
-    assert rows_of(rows, "w/o total variation")[0][2:5] == ["24.00", "-2.00", "holds (1 of 2 seeds)"]
-    assert rows_of(rows, "w/o flow L1")[0][4] == "within noise"
+    assert rows_of(rows, "w/o total variation")[0][2:5] == ["24.00", "-2.00", "one seed"]
+    assert rows_of(rows, "w/o coarse stage")[0][3:5] == ["-1.00 ± 0.00", "holds (3 of 4 seeds)"]
+    # 0.0, 0.1, 0.2 and 0.3: a deviation of 0.129, 3.182 of its halves.
+    assert rows_of(rows, "w/o flow L1")[0][3:5] == ["+0.15 ± 0.21", "no difference shown"]
 
 
 def test_kinds_of_test_views_and_scenes_have_sections_of_their_own(tmp_path):
@@ -496,7 +513,7 @@ def test_kinds_of_test_views_and_scenes_have_sections_of_their_own(tmp_path):
         "Table 6: modules: D-NeRF, of which mutant, hook": ["-0.90", "24.00", "-1.00"],
     }
     assert {lines[0][4] for lines in rows.values() if lines} == {"one seed"}
-    assert "noise unknown" in text
+    assert "No difference here is of three seeds or more: the page gives no verdict." in text
     assert f"{old}: another run of the same is newer" in sections["Left out"]
     with pytest.raises(ValueError, match="expected runs of ablations, but got none; make some with make ab"):
         write_ablation(write_run(tmp_path / "other").parent, tmp_path / "out")

@@ -2,15 +2,15 @@
 
 import pytest
 
-from forewarp.metrics.gain import Estimate, pooled_deviation
 from forewarp.report.choices import against, by_variant
 from forewarp.report.results import Point, Runs, read_run, read_runs
+from forewarp.report.statistics import Estimate
 from forewarp.report.tables import Column, Table
 from tests.support.runs_on_disk import write_run
 
 TABLE = Table(
     [Column("name"), Column("PSNR", signed=True), Column("steps", 0), Column("s", prefix="×")],
-    [["a|b", Estimate(0.5, 0.25), 10, 1.234], ["c", Estimate(-1.0), None, 2.0]],
+    [["a|b", Estimate(0.5, 0.25, 3), 10, 1.234], ["c", Estimate(-1.0), None, 2.0]],
     "Of two:",
 )
 
@@ -98,14 +98,12 @@ def test_tables_as_markdown_and_as_csv():
         *("Of two:", ""),
         "| name   |         PSNR |   steps |     s |",
         "|:-------|-------------:|--------:|------:|",
-        "| a\\|b   | +0.50 ± 0.25 |      10 | ×1.23 |",
+        "| a\\|b   | +0.50 ± 0.62 |      10 | ×1.23 |",
         "| c      |        -1.00 |         | ×2.00 |",
     ]
     assert str(Table([Column("a")], [])).splitlines() == ["| a   |", "|-----|"]
-    assert TABLE.csv().splitlines() == ["name,PSNR,PSNR sd,steps,s", "a|b,0.5,0.25,10,1.234", "c,-1.0,,,2.0"]
-
-
-def test_estimates_and_noise():
-    for values, estimate in (([], None), ([2.0], Estimate(2.0)), ([1.0, 2.0, 3.0], Estimate(2.0, 1.0))):
-        assert Estimate.of([*values, None]) == estimate
-    assert pooled_deviation([[1.0], []]) is None
+    lines = [line.split(",") for line in TABLE.csv().splitlines()]
+    assert lines[0] == ["name", "PSNR", "PSNR ci95", "PSNR n", "steps", "s"]
+    assert lines[1][:2] + lines[1][3:] == ["a|b", "0.5", "3", "10", "1.234"]
+    assert float(lines[1][2]) == pytest.approx(0.62103, abs=1e-5)  # 4.30265 * 0.25 / sqrt(3)
+    assert lines[2] == ["c", "-1.0", "", "1", "", "2.0"]

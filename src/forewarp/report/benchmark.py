@@ -17,14 +17,13 @@ from typing import NamedTuple
 import yaml
 
 from forewarp.files import MOST_CONFIG, read_rows, read_text, replace_file
-from forewarp.metrics.gain import Estimate
 from forewarp.metrics.registry import metric_of
 from forewarp.report import figures
 from forewarp.report.results import CONDITIONS, Runs, add_rows, grouped, in_words, key_of, length, read_runs
+from forewarp.report.statistics import LEAST, by_chance, paired_change, rank, verdict
 from forewarp.report.tables import Column, Table, rendered, score_columns
 
 OTHERS = Path(__file__).with_name("published.yaml")  # results of others
-NOISE = 0.2  # dB that chance may take: with more of something PSNR may be this much lower
 LENGTHS = 3  # of training, at least: two points make no curve
 TASK = ("scene", "preset", "minutes", *CONDITIONS)
 BEGIN = {"label": "scene", "took": Column("minutes", 0)}
@@ -133,8 +132,8 @@ def row_of(group: Runs, **more: object) -> dict:
     """Make the row of tables for runs that differ in the seed; ``took``: the minutes that they took."""
     took = length(group[0]["minutes"]).removesuffix(" min") + group.taken()[1]
     step, error = group.mean("step"), group.estimate("motion_error")
-    moving = error and Estimate(*(part and 100 * part for part in (error.mean, error.deviation)))
-    more |= {"ms": step and 1000 * step, "moving": moving, "particles": size_of(group) or None}
+    more |= {"ms": step and 1000 * step, "moving": error and error.times(100)}
+    more |= {"particles": size_of(group) or None}
     return group.summary(took=took, **more)
 
 
@@ -163,7 +162,6 @@ def _of_method(method: str, runs: Runs, others: Mapping[str, Runs]) -> dict:
     costs = BEGIN | {name: replace(column, spread=False) for name, column in COSTS.items()}
     return {
         "method": method,
-        "noise": NOISE,
         "machine": made_on(runs),
         "versions": len({row["commit"] or row["day"] for row in runs}),
         "by_minutes": _by_minutes(plain(runs)),
@@ -198,24 +196,13 @@ def _by_minutes(runs: Runs) -> Table:
 
 
 def _against_fewer(runs: Runs, varied: str, order: Callable[[Runs], float]) -> list[dict]:
-    """List groups that differ in one thing alone, each with how its PSNR is to that of the group before."""
+    """List groups that differ in one thing alone, each with how its PSNR changes from the group before."""
     shared, lines = [name for name in TASK if name != varied], []
     series = grouped((key_of(group[0], shared), group) for group in alike(runs))
     for groups in (sorted(found, key=order) for found in series.values() if len(found) > 1):
-        psnr = [None, *(group.mean("psnr") for group in groups)]
-        for group, before, now in zip(groups, psnr, psnr[1:]):
-            lines.append(row_of(group, verdict="" if None in (before, now) else held(before, now)))
+        for before, group in zip([None, *groups], groups):
+            lines.append(row_of(group, verdict=above(group, before) if before else ""))
     return lines
-
-
-def held(before: float, now: float) -> str:
-    """Say whether a PSNR (dB) holds against the one before.
-
-    >>> held(30.0, 29.85), held(30.0, 29.5), held(30.0, 31.0)
-    ('holds (-0.15 dB)', 'falls by 0.50 dB', 'holds (+1.00 dB)')
-    """
-    change = now - before
-    return f"holds ({change:+.2f} dB)" if change >= -NOISE - 1e-9 else f"falls by {-change:.2f} dB"
 
 
 def _larger(runs: Runs) -> list[dict]:
@@ -229,14 +216,14 @@ def _larger(runs: Runs) -> list[dict]:
         size = f"{width // by}x{height // by}"
         small = key_of(group[0] | {"pictures": pictures.replace(reduced[0], size)}, TASK)
         same = [other for other in groups if key_of(other[0], TASK) == small]
-        verdict = f"{above(group, same[-1])} the run that learned from {size}" if same else ""
-        lines += [row_of(group, verdict=verdict), *(row_of(other, verdict="") for other in same)]
+        told = f"{above(group, same[-1])}, to the run that learned from {size}" if same else ""
+        lines += [row_of(group, verdict=told), *(row_of(other, verdict="") for other in same)]
     return lines
 
 
 def _beside(method: str, runs: Runs, other: str, rivals: Runs) -> Table:
     """Compare a method with another on the same scenes after equal minutes."""
-    names, lines = Runs([*runs, *rivals]).scores(), []
+    names, lines, changes = Runs([*runs, *rivals]).scores(), [], []
     for group in alike(plain(runs)):
         for rival in alike(plain(rivals)):
             rows = group[0], rival[0]
@@ -247,25 +234,31 @@ def _beside(method: str, runs: Runs, other: str, rivals: Runs) -> Table:
                 seeds, psnr = f"{len(group)} and {len(rival)}", (g.estimate("psnr") for g in (group, rival))
                 verdicts = (above(group, rival, name) for name in names)
                 lines.append([line["label"], line["took"], seeds, *psnr, *verdicts])
+                changes += [paired_change(group.paired(rival), name) for name in names]
     titles = [metric_of(name).title for name in names]
-    return Table([*BEGIN.values(), "seeds", f"`{method}`", f"`{other}`", *titles], lines)
+    columns = [*BEGIN.values(), "seeds", f"`{method}`", f"`{other}`", *titles]
+    return Table(columns, lines, by_chance(changes))
 
 
 def above(group: Runs, other: Runs, name: str = "psnr") -> str:
-    """Say by how much a mean is above or below another.
+    """Say by how much a metric differs from that of other runs, in pairs by seed, with a verdict where there
+    are enough pairs.
 
-    >>> above(Runs([{"psnr": 30.0}]), Runs([{"psnr": 29.5}]))
-    'above by 0.50 dB'
-    >>> above(Runs([{"lpips": 0.2}]), Runs([{"lpips": 0.1}]), "lpips")
-    'worse by 0.1000'
+    >>> one, two = (Runs({"seed": seed, "psnr": psnr + seed} for seed in range(3)) for psnr in (30.0, 29.5))
+    >>> above(one, two), above(Runs(one[:1]), two), above(Runs(one[:1]), Runs(two[1:]))
+    ('+0.50 ± 0.00 dB, above', '+0.50 dB', 'no seed in common')
+    >>> lpips = [Runs({"seed": seed, "lpips": value} for seed in range(3)) for value in (0.2, 0.1)]
+    >>> above(*lpips, "lpips")
+    '+0.1000 ± 0.0000, worse'
     """
-    own, its, metric = group.mean(name), other.mean(name), metric_of(name)
-    if None in (own, its):
+    if None in (group.mean(name), other.mean(name)):
         return ""
-    if not round(abs(own - its), metric.digits):
-        return "equal"
+    change, metric = paired_change(group.paired(other), name), metric_of(name)
+    if change is None:
+        return "no seed in common"
     words = ("above", "below") if metric.higher_is_better else ("worse", "better")
-    return f"{words[own < its]} by {abs(own - its):.{metric.digits}f} {metric.unit}".rstrip()
+    told = f"{Column('', metric.digits, signed=True).text(change)} {metric.unit}".rstrip()
+    return f"{told}, {verdict(change, *words)}" if change.count >= LEAST else told
 
 
 def _write_lengths(tables: Mapping[str, Runs], out: Path, published: Sequence[Published]) -> list[Path]:
@@ -398,7 +391,13 @@ def _reached(runs: Runs, others: Runs) -> Table:
     paper = {"forward": " (the paper's)"}
     titles = [f"`{group[0]['name']}`{paper.get(group[0]['method'], '')}" for group in groups]
     rows = (group.summary(title=title) for group, title in zip(groups, titles))
-    return Table.of(rows, columns, f"**{about}**")
+    marks = {}
+    for name in others.scores():
+        scores = {i: {row["seed"]: row.get(name) for row in group} for i, group in enumerate(groups)}
+        scores = {i: own for i, own in scores.items() if None not in own.values()}
+        best = rank(scores, metric_of(name).higher_is_better)[:1]
+        marks |= {(i, list(columns).index(name)): "best" for tied in best for i in tied}
+    return replace(Table.of(rows, columns, f"**{about}**"), marks=marks)
 
 
 def _departures(runs: Runs) -> Table:

@@ -15,17 +15,16 @@ from pathlib import Path
 from statistics import mode
 
 from forewarp.files import read_json, replace_file
-from forewarp.metrics.gain import FACTORS, Estimate, measure_effect
 from forewarp.metrics.registry import METRICS, metric_of
 from forewarp.report.benchmark import read_published
 from forewarp.report.figures import draw_scene
 from forewarp.report.results import KINDS, PLACES, Point, Row, Runs, overrides, read_runs
+from forewarp.report.statistics import FACTORS, Estimate, by_chance, paired_change, verdict
 from forewarp.report.tables import Column, Difference, Table, rendered, score_columns
 
 COSTS = {"epe": Column("EPE", 4), "step": Column("s/step", 3), "frame": Column("s/frame")}
 COSTS |= {"memory": Column("GiB"), "parameters": Column("parameters (M)", 3), "steps": Column("steps", 0)}
 CHOICES = {"auto": "planned", "base": "the preset", "all_effects": "every effect", "no_effects": "none"}
-LEAST = 0.1  # dB; a smaller difference counts as none
 
 
 def seconds_to(points: Sequence[Point], psnr: float) -> float | None:
@@ -168,11 +167,12 @@ def changes(runs: Runs) -> Table:
     for variant, group in by_variant(runs).items():
         if variant != (other := against(group[0], runs)):
             pairs = group.paired(runs.where(variant=other))
-            lines.append([variant, other, len(pairs), *(measure_effect(pairs, name) for name in measures)])
+            lines.append([variant, other, len(pairs), *(paired_change(pairs, name) for name in measures)])
     columns = ["variant", "against", Column("seeds", 0)]
     for name, column in measures.items():
         columns.append(Column(column.name, prefix="×") if name in FACTORS else replace(column, signed=True))
-    return Table(columns, lines, "Changes:")
+    differences = [cell for line in lines for cell, name in zip(line[3:], measures) if name not in FACTORS]
+    return Table(columns, lines, f"Changes. {by_chance(differences)}")
 
 
 def every_run(runs: Runs) -> Table:
@@ -209,39 +209,27 @@ def write_effects(folder: Path, out: Path) -> list[Path]:
 
 def choices(runs: Runs) -> Table:
     """List for every scene the numbers of each choice, mean over seeds, and how the planned one is to the
-    best of the others: two standard errors of their differences by seed are noise.
+    best of the others, in pairs by seed.
     """
     present = [name for name in CHOICES if runs.where(ablation=name)]
     columns = ["scene", Column("seeds", 0), Column("minutes", None), *(CHOICES[name] for name in present)]
     columns += [Column("planned - best", signed=True), "", Column("planning, s", 1)]
-    lines = []
+    lines, changes = [], []
     for scene, found in runs.by("scene").items():
         by_choice = {name: found.where(ablation=name) for name in present}
         planned = by_choice.get("auto", Runs())
         means = {name: own.mean("psnr") for name, own in by_choice.items() if own and name != "auto"}
         best = max(means, key=means.get) if means and planned else None
-        change, verdict = None, ""
+        change, words = None, ""
         if best is not None:
-            pairs = planned.paired(by_choice[best])
-            change = measure_effect(pairs, "psnr")
-            verdict = _verdict(change, len(pairs)) + f", {CHOICES[best]}"
+            change = paired_change(planned.paired(by_choice[best]), "psnr")
+            words = f"{verdict(change, below='**below**')}, {CHOICES[best]}"
+            changes.append(change)
         minutes = " or ".join(f"{minutes:g}" for minutes in found.by("minutes") if minutes)
         planning = Estimate.of(row["plan"]["seconds"] for row in planned if row["plan"])
         psnr, seeds = [own.estimate("psnr") for own in by_choice.values()], max(map(len, by_choice.values()))
-        lines.append([scene, seeds, minutes, *psnr, change, verdict, planning])
-    return Table(columns, lines)
-
-
-def _verdict(change: Estimate | None, pairs: int) -> str:
-    """Say whether a planned run is above, within or below noise."""
-    if change is None:
-        return "no pair"
-    if pairs == 1:
-        return "one seed"
-    noise = max(LEAST, 2 * (change.deviation or 0.0) / math.sqrt(max(pairs, 1)))
-    if abs(change.mean) <= noise:
-        return f"within noise ({noise:.2f})"
-    return "above" if change.mean > 0 else "**below**"
+        lines.append([scene, seeds, minutes, *psnr, change, words, planning])
+    return Table(columns, lines, by_chance(changes))
 
 
 def write_search(folder: Path, out: Path) -> list[Path]:

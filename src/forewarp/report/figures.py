@@ -304,8 +304,8 @@ def draw_resolution(path: Path, rows: Sequence[Row]) -> Path | None:
     figure, ((axis,),) = figure_of(1, 1, (7, 4.5))
     for label, sides in lines.items():
         found = [of_side.estimate("psnr") for of_side in sides.values()]
-        spread = [e.deviation or 0 for e in found]
-        axis.errorbar([*sides], [e.mean for e in found], spread, marker="o", label=label)
+        bars = [e.error_bar for e in found]
+        axis.errorbar([*sides], [e.mean for e in found], bars, marker="o", label=label)
     title = "Performance with different resolutions"
     axis.set(xlabel="voxels along a side", ylabel="PSNR (dB)", title=title)
     axis.grid(alpha=0.3)

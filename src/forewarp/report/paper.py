@@ -18,11 +18,11 @@ import numpy as np
 import yaml
 
 from forewarp.files import MOST_CONFIG, read_text, replace_file
-from forewarp.metrics.gain import Estimate, pooled_deviation
 from forewarp.metrics.registry import metric_of
 from forewarp.report import figures
 from forewarp.report.choices import every_run
 from forewarp.report.results import KINDS, Point, Row, Runs, grouped, read_runs
+from forewarp.report.statistics import INTERVALS, LEAST, Estimate, by_chance, rank, verdict
 from forewarp.report.tables import Cell, Column, Difference, Section, Table, rendered
 
 PAPER = Path(__file__).with_name("paper.yaml")  # the printed numbers
@@ -35,8 +35,7 @@ DATASETS = ("dnerf", "hypernerf", "nhr", "lego_complete")
 DEPTH = {"depth_delta_1.25": "δ<1.25", "depth_delta_1.5625": "δ<1.25²"}  # printed as percentages
 COSTS = (Column("training, s a run", 0), Column("GiB"), Column("parameters (M)", 3), Column("steps", 0))
 COSTS += (Column("protocol"), Column("device"))  # what a measured row says beside its scores
-LEAST = 0.1  # dB that a difference must exceed: of two seeds both may err alike
-ORDERS = ("holds", "within noise", "reversed", "one seed")
+ORDERS = ("holds", "no difference shown", "reversed")  # what may become of the paper's order
 AT_REST = "compact"  # the preset whose training comes to rest
 OF_REST = re.compile(r"^## At rest$.*?(?=^## |\Z)", re.MULTILINE | re.DOTALL)  # on the page
 LAST = 0.2  # of a run's training: what its curve gains there tells whether it was at rest
@@ -191,8 +190,8 @@ def comparison(table: PaperTable, runs: Runs, numbers: Mapping[str, int] | None 
     """Make a table of each published row with the measured ones of its method below it, then the others.
 
     After each measured row comes its difference from the published one. Columns are of the datasets that the
-    runs are of. In each column the best and the
-    second best of the measured rows are marked, if all may be compared.
+    runs are of. In each column the best and the second best of the measured rows are marked, with all that
+    tie, if all may be compared.
 
     Args:
         table: the paper's table.
@@ -203,7 +202,7 @@ def comparison(table: PaperTable, runs: Runs, numbers: Mapping[str, int] | None 
     datasets = {run["origin"] for of_row in found for run in of_row}
     table = replace(table, groups=[group for group in table.groups if group.dataset in datasets])
     numbers, no_costs = numbers or numbered(runs), [None] * len(COSTS)
-    lines, rules = [], []
+    lines, rules, places = [], [], {}
     for printed in [*table.rows, None]:
         of_method = [of_row for of_row in found if table.printed(of_row[0]) is printed]
         rules += [len(lines)] if of_method or (printed and lines and lines[-1][1] != "published") else []
@@ -211,6 +210,7 @@ def comparison(table: PaperTable, runs: Runs, numbers: Mapping[str, int] | None 
         lines += [[printed.name, "published", *values, *no_costs]] if printed else []
         for of_row in of_method:
             cells = cells_of(of_row, table)
+            places[len(lines)] = of_row
             lines.append([name_of(of_row, found), "measured", *cells, *costs_of(of_row, numbers)])
             if printed and any(cells):
                 both = zip(cells, values)
@@ -218,7 +218,7 @@ def comparison(table: PaperTable, runs: Runs, numbers: Mapping[str, int] | None 
                 lines.append(["", "difference to the paper", *differences, *no_costs])
     columns = ["method", "kind", *(_column(*column) for column in table.columns), *COSTS]
     rules = [rule for rule in rules if rule]
-    return Table(columns, lines, marks=_marks(found, table, lines, 2), rules=rules)
+    return Table(columns, lines, _caption(lines), _marks(places, table, 2), rules)
 
 
 def stand_in(table: PaperTable, runs: Runs, numbers: Mapping[str, int] | None = None) -> Table | None:
@@ -241,7 +241,7 @@ def stand_in(table: PaperTable, runs: Runs, numbers: Mapping[str, int] | None = 
         lines.append([name_of(of_row, found), *cells_of(of_row, made), *costs_of(of_row, numbers), *beside])
     columns = ["measured", *(_column(*column) for column in made.columns), *COSTS, "published as"]
     columns += [f"published: {group.name} PSNR" for group in shown]
-    return Table(columns, lines, marks=_marks(found, made, lines, 1)).filled()
+    return Table(columns, lines, _caption(lines), _marks(dict(enumerate(found)), made, 1)).filled()
 
 
 def counterpart(table: PaperTable, runs: Runs) -> PaperTable | None:
@@ -304,21 +304,29 @@ def _column(group: Group, metric: str) -> Column:
     return Column(f"{group.name} {title}{'↑' if known.higher_is_better else '↓'}", min(known.digits, 3))
 
 
-def _marks(found: Sequence[Runs], table: PaperTable, lines: Sequence[Sequence[Cell]], first: int) -> dict:
-    """Mark the best and the second best measured score of each column from ``first`` on; equal texts tie.
+def _marks(found: Mapping[int, Runs], table: PaperTable, first: int) -> dict:
+    """Mark the best and the second best measured scores of each column from ``first`` on, with all that tie.
 
     None where rows differ in more than method and variant: in budget, machine or test views.
+
+    Args:
+        found: line -> runs of the measured row there.
+        table: whose columns these are.
+        first: column of the first score.
     """
     marks = {}
-    comparable = len(Runs(of_row[0] for of_row in found).by(*BUDGET)) == 1
+    comparable = len(Runs(of_row[0] for of_row in found.values()).by(*BUDGET)) == 1
     for j, (group, metric) in enumerate(table.columns if comparable else (), first):
-        digits, scores = _column(group, metric).digits, enumerate(line[j] for line in lines)
-        values = {i: round(score.mean, digits) for i, score in scores if isinstance(score, Estimate)}
-        order = sorted(set(values.values()), reverse=metric_of(metric).higher_is_better)[:2]
-        for i, value in values.items():
-            if len(values) > 1 and value in order:
-                marks[i, j] = ("best", "second")[order.index(value)]
+        scores = {i: by_seed(of_row, group, metric) for i, of_row in found.items()}
+        for mark, lines in zip(("best", "second"), rank(scores, metric_of(metric).higher_is_better)):
+            marks |= {(i, j): mark for i in lines}
     return marks
+
+
+def _caption(lines: Sequence[Sequence[Cell]]) -> str:
+    """Say what stands beside means, where there are any of several seeds."""
+    several = any(isinstance(cell, Estimate) and cell.count > 1 for line in lines for cell in line)
+    return f"{INTERVALS}." if several else ""
 
 
 def write_paper(
@@ -485,17 +493,20 @@ def write_ablation(folder: Path, out: Path, published: Path | None = None) -> li
 def _page(tables: Sequence[PaperTable], runs: Runs, left_out: Sequence[str]) -> str:
     """Make the page of all runs that are not at rest."""
     numbers = numbered(runs)
-    orders: dict[str, list[str]] = {}  # of each budget, what became of the paper's order in each row
+    orders: dict[str, list[tuple[str, Estimate]]] = {}  # by budget: each row's order, and its difference
     sections = [section for table in tables for section in _ablated(table, runs, orders, numbers)]
-    counts = {b: [sum(o.startswith(kind) for o in found) for kind in ORDERS] for b, found in orders.items()}
-    lines = [[budget, len(orders[budget]), *count] for budget, count in counts.items()]
-    columns = ["budget of a run", *(Column(kind, 0) for kind in ("rows", *ORDERS))]
-    caption = "Rows of all tables below, by what became of the paper's order:"
+    lines = []
+    for budget, rows in orders.items():
+        counts = [sum(order.startswith(kind) for order, _ in rows) for kind in ORDERS]
+        lines.append([budget, len(rows), *counts, len(rows) - sum(counts)])
+    columns = ["budget of a run", *(Column(kind, 0) for kind in ("rows", *ORDERS, "too few seeds"))]
+    chance = by_chance(change for rows in orders.values() for _, change in rows)
+    caption = f"Rows of all tables below, by what became of the paper's order. {chance}"
     used = runs.where(ablation={variant for table in tables for variant in table.variants})
     about = _about(sections, used, numbers)
     sections = [Section("In short", [Table(columns, lines, caption)]), *sections, about] if runs else []
     sections += [Section("Left out", facts=left_out)] if left_out else []
-    return rendered("ablation.md.j2", sections=sections, least=LEAST)
+    return rendered("ablation.md.j2", sections=sections)
 
 
 def _at_rest(tables: Sequence[PaperTable], runs: Runs) -> dict:
@@ -504,26 +515,23 @@ def _at_rest(tables: Sequence[PaperTable], runs: Runs) -> dict:
     columns += [Column("difference", signed=True), "order", "canonical", Column("last fifth", signed=True)]
     columns += [Column("steps", 0, spread=False), Column("minutes", 1)]
     lines: list[list[Cell]] = []
-    noises = []
     for table in tables:
         for group, own, _ in _groups(table, runs) if "no_upsampling" in table.variants else ():
             printed, scene = _printed_changes(table, group), ", ".join(group.scenes)
             rows = [(row.name, row.variant, own.where(ablation=row.variant)) for row in table.parts]
             rows.append(("a backward warp (not in the paper)", None, own.where(method="backward")))
             psnr = [by_seed(of_row, group, "psnr") for *_, of_row in rows]
-            changes = [[of[seed] - psnr[0][seed] for seed in of if seed in psnr[0]] for of in psnr]
-            noise = pooled_deviation(changes[1:])
-            noises.append(f"{scene} " + ("unknown" if noise is None else f"{noise:.2f} dB"))
-            for (name, variant, of_row), scores, change in zip(rows, psnr, changes, strict=True):
+            for (name, variant, of_row), scores in zip(rows, psnr, strict=True):
                 if scores:
-                    change = Estimate.of(change) if variant != "full" else None
-                    order = verdict(change.mean, printed.get(variant), noise) if change else None
+                    change = _change(scores, psnr[0]) if variant != "full" else None
+                    order = order_of(change, printed.get(variant))
                     late = Estimate.of(late_gain(run["points"]) for run in of_row)
                     line = [scene, name, printed.get(variant), Estimate.of(scores.values()), change, order]
                     took = of_row.mean("train")
                     line += [of_row.estimate("psnr_canonical"), late]
                     lines.append([*line, of_row.mean("steps"), took and took / 60])
-    return {"table": Table(columns, lines), "noise": "; ".join(noises), "facts": facts(runs, numbered(runs))}
+    table = Table(columns, lines, by_chance(line[4] for line in lines))
+    return {"table": table, "facts": facts(runs, numbered(runs))}
 
 
 def late_gain(points: Sequence[Point]) -> float | None:
@@ -548,7 +556,7 @@ def _groups(table: PaperTable, runs: Runs) -> Iterator[tuple[Group, Runs, bool]]
 
 
 def _ablated(
-    table: PaperTable, runs: Runs, orders: dict[str, list[str]], numbers: Mapping[str, int]
+    table: PaperTable, runs: Runs, orders: dict[str, list[tuple[str, Estimate]]], numbers: Mapping[str, int]
 ) -> list[Section]:
     """Make a section for each scene, or mean of scenes, on which the table's rows were measured."""
     sections = []
@@ -564,14 +572,16 @@ def _ablated(
     return sections
 
 
-def _changes(table: PaperTable, group: Group, runs: Runs, orders: dict[str, list[str]]) -> Table | None:
+def _changes(
+    table: PaperTable, group: Group, runs: Runs, orders: dict[str, list[tuple[str, Estimate]]]
+) -> Table | None:
     """List what each row changes on the scenes of ``group``, for each budget; None if nothing was measured.
 
     Args:
         table: the paper's table.
         group: the scenes and the kind of test view; of the table, or of its counterpart.
         runs: of the group's scenes.
-        orders: what became of the paper's order is added here, by budget.
+        orders: what became of the paper's order is added here, by budget, with the difference.
     """
     variants = list(runs.by("ablation"))
     by_budget: dict[tuple, dict[str, Runs]] = {}
@@ -591,22 +601,18 @@ def _changes(table: PaperTable, group: Group, runs: Runs, orders: dict[str, list
         label = _label(found["full"][0], [other["full"][0] for other in budgets])
         psnr = {variant: by_seed(of_row, group, "psnr") for variant, of_row in found.items()}
         whole = psnr["full"]
-        changes = {v: [of[seed] - whole[seed] for seed in of if seed in whole] for v, of in psnr.items()}
-        del changes["full"]
-        noise = pooled_deviation(list(changes.values()))  # of the rows of other tables, too
         columns += [f"{label}: PSNR", Column("difference", signed=True), "order"]
         columns += [Column("s a step", 3), Column("of a step of Ours", prefix="×")]
-        spread = f"noise {noise:.2f} dB" if noise is not None else "noise unknown"
-        captions.append(f"{label}, {len(whole)} seed{'s' * (len(whole) != 1)}: {spread}")
+        captions.append(f"{label}, {len(whole)} seed{'s' * (len(whole) != 1)}")
         for row, line in zip(table.parts, lines):
             if row.variant not in found:
                 line += [None] * 5
                 continue
-            change, order = Estimate.of(changes.get(row.variant, [])), None
-            if change and (order := verdict(change.mean, printed.get(row.variant), noise)):
-                seeds = len(psnr[row.variant])
-                order += f" ({seeds} of {len(whole)} seeds)" if seeds < len(whole) else ""
-                orders.setdefault(label, []).append(order)
+            change = _change(psnr[row.variant], whole) if row.variant != "full" else None
+            if order := order_of(change, printed.get(row.variant)):
+                fewer = LEAST <= change.count < len(whole)
+                order += f" ({change.count} of {len(whole)} seeds)" * fewer
+                orders.setdefault(label, []).append((order, change))
             step, of_whole = found[row.variant].mean("step"), found["full"].mean("step")
             times = step / of_whole if step and of_whole else None
             line += [Estimate.of(psnr[row.variant].values()), change, order, step, times]
@@ -614,19 +620,22 @@ def _changes(table: PaperTable, group: Group, runs: Runs, orders: dict[str, list
     return Table(columns, kept, "; ".join(captions) + ".")
 
 
-def verdict(change: float, printed: float | None, noise: float | None) -> str:
-    """Say whether the paper's order of a row and ``Ours`` holds.
+def _change(scores: Mapping[int, float], whole: Mapping[int, float]) -> Estimate | None:
+    """Estimate how scores by seed differ from those of ``Ours`` with the same seeds."""
+    return Estimate.of(scores[seed] - whole[seed] for seed in scores if seed in whole)
 
-    >>> verdict(-0.5, -1.0, 0.2), verdict(0.5, -1.0, 0.2), verdict(-0.1, -1.0, 0.2)
-    ('holds', 'reversed', 'within noise')
-    >>> verdict(-0.5, -1.0, None), verdict(-0.5, None, 0.2)
-    ('one seed', '')
+
+def order_of(change: Estimate | None, printed: float | None) -> str:
+    """Say whether a row's order to ``Ours`` is the one that the paper prints; "" where it prints none.
+
+    >>> [order_of(Estimate(mean, 0.1, 3), -1.0) for mean in (-0.5, 0.5, -0.1)]
+    ['holds', 'reversed', 'no difference shown']
+    >>> order_of(Estimate(-0.5, 0.1, 2), -1.0), order_of(Estimate(-0.5, 0.1, 3), None)
+    ('two seeds', '')
     """
-    if not printed or noise is None:
-        return "one seed" if printed else ""
-    if abs(change) <= max(noise, LEAST):
-        return "within noise"
-    return "holds" if change * printed > 0 else "reversed"
+    if change is None or not printed:
+        return ""
+    return verdict(change, *(("holds", "reversed") if printed > 0 else ("reversed", "holds")))
 
 
 def _printed_changes(table: PaperTable, group: Group) -> dict[str, float]:

@@ -22,8 +22,8 @@ from typing import NamedTuple
 import yaml
 
 from forewarp.files import MOST_CONFIG, load_json, read_json, read_rows, read_text, replace_file
-from forewarp.metrics.gain import Estimate
 from forewarp.metrics.registry import metric_of
+from forewarp.report.statistics import Estimate
 
 Row = dict
 

@@ -1,4 +1,4 @@
-"""Tables of numbers with their spread over repetitions, and pages from templates."""
+"""Tables of numbers with their intervals over seeds, and pages from templates."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 from tabulate import tabulate
 
-from forewarp.metrics.gain import Estimate
 from forewarp.metrics.registry import metric_of
 from forewarp.report.results import NETS
+from forewarp.report.statistics import INTERVALS, Estimate
 
 TEMPLATES = Path(__file__).with_name("templates")
 MARKS = {
@@ -47,7 +47,7 @@ class Column:
     """A column's title and number format.
 
     ``digits`` after the point, None: as many as a number has, at most four that count; ``prefix`` stands
-    before numbers; ``spread``: show deviations.
+    before numbers; ``spread``: show after a mean what ``statistics.INTERVALS`` says.
     """
 
     name: str
@@ -59,19 +59,24 @@ class Column:
     def text(self, value: Cell) -> str:
         """Format a cell; None is empty.
 
-        >>> Column("PSNR", signed=True).text(Estimate(0.5, 0.1))
-        '+0.50 ± 0.10'
+        >>> [Column("PSNR", signed=True).text(Estimate.of(v)) for v in ([0.4, 0.5, 0.6], [0.4, 0.6], [0.4])]
+        ['+0.50 ± 0.25', '+0.50 (+0.40, +0.60)', '+0.40']
         >>> [Column("minutes", None).text(minutes) for minutes in (0.05, 1.0, 20.0)]
         ['0.05', '1', '20']
         """
         if value is None or isinstance(value, str):
             return value or ""
         if isinstance(value, Estimate):
-            with_spread = self.spread and value.deviation is not None
-            return self.text(value.mean) + (f" ± {value.deviation:.{self.digits}f}" if with_spread else "")
+            return self.text(value.mean) + (self._spread(value) if self.spread else "")
         sign = "+" if self.signed or isinstance(value, Difference) else ""
         form = ".4g" if self.digits is None else f".{self.digits}f"
         return f"{self.prefix}{value:{sign}{form}}"
+
+    def _spread(self, value: Estimate) -> str:
+        bar = value.error_bar
+        if value.count == 2:
+            return f" ({self.text(value.mean - bar)}, {self.text(value.mean + bar)})"
+        return f" ± {bar:.{self.digits}f}" if value.count > 2 else ""
 
 
 @dataclass(frozen=True)
@@ -153,17 +158,23 @@ class Table:
         return [[marked(i, j, text) for j, text in enumerate(row)] for i, row in enumerate(texts)]
 
     def csv(self) -> str:
-        """Return all digits as CSV; the standard deviation of an estimate has a column of its own."""
+        """Return all digits as CSV; half the interval of an estimate, and how many values it is of, have
+        columns of their own.
+        """
         lines = [[] for _ in range(1 + len(self.rows))]
         for i, column in enumerate(self.columns):
             cells = [row[i] for row in self.rows]
-            width = 1 + any(isinstance(cell, Estimate) for cell in cells)
-            parts = [(c.mean, c.deviation) if isinstance(c, Estimate) else (c, None) for c in cells]
-            for line, part in zip(lines, [(column.name, f"{column.name} sd"), *parts]):
+            parts = [(column.name, f"{column.name} ci95", f"{column.name} n"), *map(_parts, cells)]
+            width = 3 if any(isinstance(cell, Estimate) for cell in cells) else 1
+            for line, part in zip(lines, parts):
                 line += part[:width]
         file = io.StringIO()
         csv.writer(file, lineterminator="\n").writerows(lines)  # None is empty
         return file.getvalue()
+
+
+def _parts(cell: Cell) -> tuple:
+    return (cell.mean, cell.half_width, cell.count) if isinstance(cell, Estimate) else (cell, None, None)
 
 
 def score_columns(names: Iterable[str], *, with_unit: bool = False) -> dict[str, Column]:
@@ -197,7 +208,7 @@ def _environment() -> Environment:
     blocks = dict.fromkeys(("trim_blocks", "lstrip_blocks", "keep_trailing_newline"), True)
     environment = Environment(loader=FileSystemLoader(TEMPLATES), undefined=StrictUndefined, **blocks)
     environment.autoescape = lambda name: name.endswith(".html.j2")
-    environment.globals["nets"] = NETS
+    environment.globals |= {"nets": NETS, "intervals": INTERVALS}
     environment.filters |= {
         "tex": latex_text,
         "tex_head": _latex_head,

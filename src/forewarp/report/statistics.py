@@ -1,0 +1,182 @@
+"""Compare numbers of independent runs: estimates with intervals, paired changes, verdicts, ties, chance.
+
+Every page compares by these functions. docs/experiments.md, "How numbers are compared", gives the reasons.
+"""
+
+from __future__ import annotations
+
+import math
+import statistics
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+from scipy.special import stdtrit
+
+LEVEL = 0.95  # of intervals
+LEAST = 3  # independent values that a verdict needs
+FACTORS = ("step", "frame", "memory", "parameters", "steps")  # measures that change by a factor
+SEEDS = ("no pair", "one seed", "two seeds")  # in place of a verdict
+INTERVALS = "± is half the 95 % confidence interval of a mean (Student's t over the seeds)"
+INTERVALS += "; of two seeds both values are in brackets"
+NO_VERDICTS = "No difference here is of three seeds or more: the page gives no verdict."
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A mean over independent values, as a rule one of each seed.
+
+    Attributes:
+        mean: their mean.
+        deviation: the sample's standard deviation; None of a single value.
+        count: how many there are.
+    """
+
+    mean: float
+    deviation: float | None = None
+    count: int = 1
+
+    @classmethod
+    def of(cls, values: Iterable[float | None]) -> Estimate | None:
+        """Estimate from the values that are not None; None if there are none.
+
+        >>> Estimate.of([1.0, None, 3.0])
+        Estimate(mean=2.0, deviation=1.4142135623730951, count=2)
+        """
+        known = [value for value in values if value is not None]
+        if not known:
+            return None
+        deviation = statistics.stdev(known) if len(known) > 1 else None
+        return cls(statistics.fmean(known), deviation, len(known))
+
+    def times(self, factor: float) -> Estimate:
+        """Return the estimate in another unit.
+
+        >>> Estimate(0.5, 0.25, 3).times(100)
+        Estimate(mean=50.0, deviation=25.0, count=3)
+        """
+        deviation = None if self.deviation is None else self.deviation * abs(factor)
+        return Estimate(self.mean * factor, deviation, self.count)
+
+    @property
+    def half_width(self) -> float | None:
+        """Half the 95 % confidence interval of the mean, by Student's t; None of a single value.
+
+        >>> round(Estimate.of([1.0, 2.0, 3.0]).half_width, 3)  # 4.303 standard errors
+        2.484
+        """
+        return self.half_width_among(1)
+
+    @property
+    def error_bar(self) -> float:
+        """How far a mean's error bar reaches: half the interval; of two values to each of them; of one 0."""
+        if self.count < LEAST:
+            return (self.deviation or 0.0) / math.sqrt(2)
+        return self.half_width
+
+    def half_width_among(self, questions: int) -> float | None:
+        """Half the interval whose errors, 5 % in all, so many questions share (Bonferroni)."""
+        if self.deviation is None:
+            return None
+        quantile = stdtrit(self.count - 1, 1 - (1 - LEVEL) / 2 / questions)
+        return float(quantile) * self.deviation / math.sqrt(self.count)
+
+    def sign(self, questions: int = 1) -> int | None:
+        """Return 1 or -1 where the interval leaves out 0, above or below it, else 0; None if the values are
+        fewer than ``LEAST``.
+
+        >>> [Estimate(mean, 0.18, 3).sign() for mean in (0.23, 0.5, -0.5)], Estimate(9.0, 0.1, 2).sign()
+        ([0, 1, -1], None)
+        """
+        if self.count < LEAST:
+            return None
+        if abs(self.mean) <= self.half_width_among(questions) + 1e-9:
+            return 0
+        return 1 if self.mean > 0 else -1
+
+
+def paired_change(pairs: Sequence[tuple[Mapping, Mapping]], measure: str) -> Estimate | None:
+    """Estimate the change of a measure over pairs of runs (now, before) that are equal in all else.
+
+    Where both runs of a pair have the scores of test views, ``images`` as of ``results.read_run``, their
+    difference is the mean over the views that both have. A pair counts once, however many views it has:
+    views of one run are not independent.
+
+    Args:
+        pairs: rows, one pair a seed (and scene); pairs without the measure are left out.
+        measure: name; if in ``FACTORS`` the change is a quotient, else a difference.
+
+    >>> paired_change([({"psnr": 31.0, "step": 0.2}, {"psnr": 30.0, "step": 0.1})], "step")
+    Estimate(mean=2.0, deviation=None, count=1)
+    """
+    both = [(now, before) for now, before in pairs if None not in (now.get(measure), before.get(measure))]
+    if measure in FACTORS:
+        return Estimate.of(now[measure] / before[measure] for now, before in both if before[measure])
+    return Estimate.of(_difference(now, before, measure) for now, before in both)
+
+
+def _difference(now: Mapping, before: Mapping, measure: str) -> float:
+    ours, theirs = _by_view(now, measure), _by_view(before, measure)
+    if shared := [view for view in ours if view in theirs]:
+        return statistics.fmean(ours[view] - theirs[view] for view in shared)
+    return now[measure] - before[measure]
+
+
+def _by_view(row: Mapping, measure: str) -> dict[str, float]:
+    """Return a run's score of each test view, of the kind that its scores are of."""
+    images = (image for image in row.get("images", ()) if image["ability"] == row["ability"])
+    return {image["name"]: image["scores"][measure] for image in images if measure in image["scores"]}
+
+
+def verdict(change: Estimate | None, above: str = "above", below: str = "below") -> str:
+    """Say in words whether a change is above or below 0, or that it shows no difference; of fewer than
+    ``LEAST`` pairs, how many there are.
+
+    >>> verdict(Estimate(0.23, 0.18, 3)), verdict(Estimate(-0.28, 0.06, 3)), verdict(Estimate(9.0, 0.1, 2))
+    ('no difference shown', 'below', 'two seeds')
+    """
+    if change is None or change.count < LEAST:
+        return SEEDS[change.count if change else 0]
+    return {1: above, -1: below}.get(change.sign(), "no difference shown")
+
+
+def rank(rows: Mapping[object, Mapping[object, float]], higher_is_better: bool = True) -> list[list]:
+    """Name the rows that share the first place, and those that share the second; empty if nothing is ranked.
+
+    The row with the best mean has the first place, and with it all rows whose difference from it, in pairs,
+    is not shown; the others share the second place in the same way. Which row is best is told by the same
+    values, so that every pair of rows is a question: together they have 5 %.
+
+    Args:
+        rows: name -> values by seed (or whatever pairs them); rows with fewer than ``LEAST`` are not ranked.
+        higher_is_better: whether the best mean is the largest.
+
+    >>> psnr = {"a": {0: 30.0, 1: 30.1, 2: 30.2}, "b": {0: 30.1, 1: 30.0, 2: 30.1}, "c": {0: 9, 1: 9, 2: 9}}
+    >>> rank(psnr), rank({"a": {0: 1.0}, "b": {0: 2.0}})
+    ([['a', 'b'], ['c']], [])
+    """
+    left = {name: values for name, values in rows.items() if len(values) >= LEAST}
+    if len(left) < 2:
+        return []
+    questions, sign, places = math.comb(len(left), 2), 1 if higher_is_better else -1, []
+    while left and len(places) < 2:
+        best = max(left.values(), key=lambda values: sign * statistics.fmean(values.values()))
+        changes = {n: Estimate.of(best[k] - v[k] for k in v if k in best) for n, v in left.items()}
+        places.append([name for name, change in changes.items() if not (change and change.sign(questions))])
+        left = {name: values for name, values in left.items() if name not in places[-1]}
+    return places
+
+
+def by_chance(changes: Iterable[Estimate | None]) -> str:
+    """Say of a page's differences how many would leave out 0 by chance, and how many do.
+
+    >>> print(by_chance([Estimate(1.0, 0.1, 3), Estimate(0.1, 0.1, 3), Estimate(5.0, 0.1, 2), None]))
+    2 differences are of three seeds or more; by chance 0.1 of their intervals would leave out 0, and 1 does.
+    """
+    signs = [change.sign() for change in changes if change is not None]
+    asked = [sign for sign in signs if sign is not None]
+    if not asked:
+        return NO_VERDICTS
+    shown = sum(sign != 0 for sign in asked)
+    are = f"{len(asked)} differences are" if len(asked) > 1 else "One difference is"
+    chance = f"by chance {(1 - LEVEL) * len(asked):.2g} of their intervals would leave out 0"
+    return f"{are} of three seeds or more; {chance}, and {shown} do{'es' * (shown == 1)}."
