@@ -103,6 +103,17 @@ def test_options_of_ones_own_stand_beside_ours(ok, in_tmp):
     ("arguments", "line"),
     [
         (["data.nothing_like_it=1"], "data.nothing_like_it: expected a key of the configuration, but got"),
+        (
+            ["data.train_views=3"],
+            "data.train_views: expected + before a key that is not in this configuration, ",
+        ),
+        (["callbacks.pictures.psnr_rays=5"], "; type +callbacks.pictures.psnr_rays=5"),
+        (["callbacks={progress: {every: 5}}"], "; type +callbacks.progress.every=VALUE"),
+        (["objective.fine.weights.dssim=0.2"], "; type +objective.fine.weights.dssim=0.2"),
+        (
+            ["model=forward", "model.blur=0.3"],
+            "model.blur: expected a key of the configuration, but got none",
+        ),
         (["budget.minuts=1"], "got none of this name; did you mean budget.minutes?"),
         (["model=forwrd"], "; did you mean forward?"),
         (["logger=[tensorboard,wand]"], "; none; tensorboard; wandb; did you mean wandb?"),

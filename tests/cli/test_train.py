@@ -8,6 +8,7 @@ import lightning
 import pytest
 import torch
 import yaml
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from forewarp import load
 from forewarp.methods.particles.model import Particles
@@ -84,7 +85,9 @@ def test_a_run_leaves_what_it_promises_and_says_so(fitted):
 def test_metrics_have_the_promised_shape(fitted):
     content = read(fitted / "metrics.json")
     whole = {"protocol", "seconds", "clocks", "steps", "peak_memory_bytes", "parameters", "size", "effects"}
-    assert set(content) == whole | {"test", "flow"}
+    assert set(content) == whole | {"test", "metrics", "flow"}
+    assert content["metrics"]["depth_delta_1.02"]["higher_is_better"]
+    assert content["metrics"].keys() == {name for scores in content["test"].values() for name in scores}
     seconds = content["seconds"]
     assert set(seconds) == {"train", "coarse", "fine", "render_per_frame", "render_again_per_frame"}
     assert seconds["train"] == pytest.approx(seconds["coarse"] + seconds["fine"])
@@ -97,6 +100,24 @@ def test_metrics_have_the_promised_shape(fitted):
     expected = {"scene": "vehicle", "preset": "demo", "seed": 0, "method": "forward", "scored": "warped"}
     assert expected.items() <= content["protocol"].items()
     assert {"device", "threads", "versions", "background", "resolution"} <= set(content["protocol"])
+
+
+def test_trackers_get_a_name_for_each_thing(fitted):
+    content = read(fitted / "metrics.json")
+    events = EventAccumulator(str(fitted / "tensorboard"))
+    events.Reload()
+    last = {name: events.Scalars(name)[-1] for name in events.Tags()["scalars"]}
+    expected = {f"test/{kind}/{name}": v for kind, of in content["test"].items() for name, v in of.items()}
+    expected |= {"test/flow/epe_moving": content["flow"]["epe_moving"]}
+    budgeted = sum(read(fitted / stage / "done.json")["seconds"] for stage in ("coarse", "fine"))
+    per_image = [image["seconds"] for image in read(fitted / "per_image.json")["images"]]
+    expected |= {"test/seconds_training": budgeted, "test/seconds_image": sum(per_image) / len(per_image)}
+    expected |= {f"test/{name}": content[name] for name in ("peak_memory_bytes", "parameters")}
+    found = {name: point.value for name, point in last.items() if name.startswith("test/")}
+    assert found == pytest.approx(expected, rel=1e-6)
+    assert {last[name].step for name in expected} == {sum(content["steps"].values())}
+    named = {name.split("/")[0] for name in last}
+    assert named == {"train", "lr", "val", "curve", "test"}
 
 
 @pytest.mark.slow

@@ -1,3 +1,4 @@
+import json
 import logging
 import math
 from dataclasses import replace
@@ -6,9 +7,17 @@ import pytest
 import torch
 
 from forewarp.evaluation.evaluate import table_of
-from forewarp.metrics import image, lpips
+from forewarp.metrics import image, lpips, registry
 from forewarp.metrics.lpips import LPIPS
-from forewarp.metrics.registry import METRICS, ImageSuite, Metric, summarise
+from forewarp.metrics.registry import (
+    METRICS,
+    ImageSuite,
+    Metric,
+    described,
+    metric_of,
+    summarise,
+    take_described,
+)
 from forewarp.scene.camera import Camera
 from forewarp.scene.frame import Frame
 from forewarp.scene.view import Target
@@ -140,6 +149,23 @@ def test_summary_by_hand():
 def test_summary_refuses(kind, scores, message):
     with pytest.raises(ValueError, match=message):
         summarise([(kind, scores)])
+
+
+def test_a_metric_is_known_from_a_run_where_its_package_is_not(monkeypatch):
+    monkeypatch.setattr(registry, "_STORED", {})
+    error = Metric("mean_error", "Mean error", 3, False, unit="px")
+    with monkeypatch.context() as imported:
+        imported.setitem(METRICS, "mean_error", error)
+        content = json.loads(json.dumps(described(["psnr", "mean_error"])))
+    assert metric_of("mean_error") == Metric("mean_error", "mean error")
+    take_described(content | {"psnr": {"title": "Noise", "digits": 0, "higher_is_better": False}})
+    assert metric_of("mean_error") == error
+    assert metric_of("psnr") is METRICS["psnr"]
+    for broken in (None, [1], {"a": 3}, {"b": {"digits": -1}}, {"c": {"title": 3, "higher_is_better": "no"}}):
+        take_described(broken)
+    assert metric_of("a") == Metric("a", "a")
+    assert metric_of("b") == Metric("b", "b")
+    assert metric_of("c") == Metric("c", "c")
 
 
 def test_a_registered_metric_is_scored_averaged_and_printed(monkeypatch):

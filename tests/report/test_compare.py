@@ -5,7 +5,8 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 
-from forewarp.metrics.registry import METRICS, Metric
+from forewarp.metrics import registry
+from forewarp.metrics.registry import METRICS, Metric, metric_of
 from forewarp.report.choices import compare
 from forewarp.report.results import read_compared
 from tests.support.runs_on_disk import write_run, write_views
@@ -47,6 +48,15 @@ def test_runs_side_by_side_with_their_difference(ok, runs, monkeypatch):
         ["seconds of training", "50", "50"],
         ["seconds per image", "0.500", "0.500"],
     ]
+
+
+def test_which_way_is_better_is_read_with_the_run(runs, monkeypatch):
+    monkeypatch.setattr(registry, "_STORED", {})
+    about = {"metrics": {"mean_error": {"title": "Mean error", "digits": 3, "higher_is_better": False}}}
+    folders = runs(one=of("forward", {"psnr": 30.0, "mean_error": 0.25}, **about))
+    read_compared(folders)
+    assert not metric_of("mean_error").higher_is_better
+    assert metric_of("mean_error").heading == "Mean error"
 
 
 def test_conditions_in_which_runs_differ_are_told_and_what_one_lacks_has_no_row(runs):

@@ -1,5 +1,6 @@
 """A run is built on the device that its config names, or its methods belong on."""
 
+import json
 from types import SimpleNamespace
 
 import pytest
@@ -8,7 +9,7 @@ from omegaconf import OmegaConf
 
 from forewarp.cli.train import beginning
 from forewarp.runs import build
-from forewarp.runs.config import content_hash
+from forewarp.runs.config import content_hash, plain
 from tests.support.configs import composed
 
 
@@ -131,15 +132,27 @@ def test_a_profiler_of_another_name_is_refused():
         build.build_run(config_of("+trainer.profiler=slow"))
 
 
-def test_hyperparameters_are_flat_and_hold_no_paths():
-    config = composed("experiment=demo", "model=forward")
-    config.command = "forewarp-train experiment=demo data.root=/home/me/scenes run=/tmp/run model=forward"
+@pytest.mark.parametrize("stored", [False, True])
+@pytest.mark.parametrize("model", ["forward", "particles"])
+def test_hyperparameters_are_keys_and_values_as_they_are_typed_each_once(model, stored):
+    words = ["experiment=demo", f"model={model}", "objective.fine.weights.photo=0.5"]
+    as_made = composed(*words)
+    config = OmegaConf.create(plain(as_made)) if stored else as_made
+    config.command = f"forewarp-train experiment=demo data.root=/home/me/scenes run=/tmp/run model={model}"
     found = build.hyperparameters(config)
-    assert found["_typed"] == "experiment=demo model=forward"
-    assert (found["model.name"], found["model"]) == ("forward", "ForwardWarp")
-    assert found["stage.fine.lr.density"] == config.stage.fine.lr.density
-    assert all(isinstance(value, bool | int | float | str) for value in found.values())
+    assert found.pop("command") == f"forewarp-train experiment=demo model={model}"
+    assert found["objective.fine.weights.photo"] == 0.5
     assert not any("/" in str(value) or "root" in name for name, value in found.items())
+    assert not any(".objective." in name for name in found)
+    rays = {
+        "preset.rays",
+        "data.rays",
+    } & found.keys()  # one follows the other, which a stored config has lost
+    assert rays == {"preset.rays"} or stored
+    typed = [f"{name}={json.dumps(v) if isinstance(v, bool) else v}" for name, v in found.items()]
+    again = composed(*words[:2], *typed)
+    config.command = None
+    assert plain(again) == plain(config)
 
 
 def test_runs_of_a_folder_share_decoded_frames(tmp_path, monkeypatch):

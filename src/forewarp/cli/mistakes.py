@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import difflib
 import errno
+import inspect
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
 
@@ -101,6 +102,10 @@ def unknown_key(error: Exception, name: str, arguments: list[str]) -> str | None
     if key in _every_key(_composed(name, [one for one in others if key_of(one) in ("model", "preset")])):
         removed = "expected an option, but got one that another one typed here removes"
         return f"{key}: {removed}; leave one of them out"
+    if plus := _needs_plus(config, key, keys):
+        value = next((one.partition("=")[2] for one in arguments if key_of(one) == key), "VALUE")
+        expected = "expected + before a key that is not in this configuration, but got none"
+        return f"{key}: {expected}; type {plus}={value}"
     if name == "train" and key.startswith(OF_METHODS):
         for model in ("forward", "particles"):
             of_model = [*(one for one in others if key_of(one) != "model"), f"model={model}"]
@@ -110,6 +115,40 @@ def unknown_key(error: Exception, name: str, arguments: list[str]) -> str | None
     near = difflib.get_close_matches(key, [*keys, *groups], 1, cutoff=0.8)
     advice = f"did you mean {near[0]}?" if near else f"forewarp-{name} --cfg job prints all keys"
     return f"{key}: expected a key of the configuration, but got none of this name; {advice}"
+
+
+def _needs_plus(config, key: str, keys: Sequence[str]) -> str | None:
+    """Return ``+key`` if the class that is configured there, or the method's terms, have it, else None."""
+    from hydra.utils import get_object
+    from omegaconf import OmegaConf
+
+    parent, _, argument = key.rpartition(".")
+    is_term = re.fullmatch(r"objective\.\w+\.(weights|every)", parent) is not None
+    target = (
+        OmegaConf.select(config, f"{'model' if is_term else parent}._target_") if parent in keys else None
+    )
+    siblings = [one[len(parent) + 1 :] for one in keys if one.startswith(f"{parent}.")]
+    # Of what is nearly another key, the class is not imported: that may take seconds.
+    if target is None or difflib.get_close_matches(argument, siblings, 1, cutoff=0.85):
+        return None
+    with suppress(Exception):  # an import may raise anything
+        made = get_object(target)
+        return f"+{key}" if argument in (made.terms if is_term else _arguments_of(made)) else None
+    return None
+
+
+def _arguments_of(made: Callable) -> Iterator[str]:
+    """Yield the arguments with a default of a class, and of bases and a reader that it hands others to."""
+    for part in (getattr(made, "_described_by", None), *getattr(made, "__mro__", [made])):
+        call = vars(part).get("__init__") if inspect.isclass(part) else part
+        parameters = inspect.signature(call).parameters.values() if call else ()
+        yield from (one.name for one in parameters if one.default is not one.empty)
+        if (
+            parameters
+            and inspect.isclass(part)
+            and all(one.kind is not one.VAR_KEYWORD for one in parameters)
+        ):
+            return
 
 
 def of_another(option: str, model: str, owner: str) -> str:

@@ -24,7 +24,7 @@ from forewarp.files import write_json
 from forewarp.methods.effect import switched
 from forewarp.methods.method import CarriesPixels, HasEllipsoids, HasLayers, HasTrajectories, parameter_count
 from forewarp.metrics.geometry import end_point_error
-from forewarp.metrics.registry import METRICS, ImageSuite, scores_of_parts, summarise
+from forewarp.metrics.registry import METRICS, ImageSuite, described, scores_of_parts, summarise
 from forewarp.ops.grid import block_means, reduced_depth
 from forewarp.progress import time_text
 from forewarp.scene.frame import Scene, spread, walk_of
@@ -166,6 +166,7 @@ def evaluate(
         "effects": switched(module.method),
         "test": summarise(chain(((row["ability"], row["scores"]) for row in per_image), parts)),
     }
+    metrics["metrics"] = described(dict.fromkeys(n for scores in metrics["test"].values() for n in scores))
     for name in others:
         metrics[f"test_{name}"] = summarise((row["ability"], row["others"][name]) for row in per_image)
     for name, of_motion in (("flow", flow_error), ("keypoints", keypoint_transfer)):

@@ -153,8 +153,35 @@ _LISTED = (
 METRICS: dict[str, Metric] = {metric.name: metric for metric in _LISTED}
 
 
+_STORED: dict[str, Metric] = {}  # of packages that are not imported, as runs have them
+_DESCRIBED = {"title": str, "digits": int, "higher_is_better": bool, "unit": str, "summary": bool}
+_MOST_DIGITS = 10
+
+
+def described(names: Iterable[str]) -> dict[str, dict]:
+    """Describe metrics, as ``metrics.json`` keeps them: how tables show them, and which way is better.
+
+    >>> described(["ssim"])
+    {'ssim': {'title': 'SSIM', 'digits': 4, 'higher_is_better': True, 'unit': '', 'summary': True}}
+    """
+    return {name: {key: getattr(METRICS[name], key) for key in _DESCRIBED} for name in names}
+
+
+def take_described(content: object) -> None:
+    """Let ``metric_of`` know metrics as a run's ``metrics.json`` describes them; those registered stay.
+
+    What is no description, as in a folder from someone else, is passed over.
+    """
+    for name, about in content.items() if isinstance(content, Mapping) else ():
+        known = about if isinstance(about, Mapping) else {}
+        known = {key: known[key] for key, kind in _DESCRIBED.items() if type(known.get(key)) is kind}
+        if isinstance(name, str) and 0 <= known.get("digits", 0) <= _MOST_DIGITS:
+            _STORED[name] = Metric(name, known.pop("title", name.replace("_", " ")), **known)
+
+
 def metric_of(name: str) -> Metric:
-    """Return a metric by name; one that is not registered, as of a package not imported, gets the defaults.
+    """Return a metric by name: a registered one; of a package not imported, as a run that was read describes
+    it (``take_described``); else one with the defaults.
 
     ``lpips`` is that of whichever net a table says.
 
@@ -163,7 +190,7 @@ def metric_of(name: str) -> Metric:
     """
     if name == "lpips":
         return Metric("lpips", "LPIPS", higher_is_better=False)
-    return METRICS.get(name) or Metric(name, name.replace("_", " "))
+    return METRICS.get(name) or _STORED.get(name) or Metric(name, name.replace("_", " "))
 
 
 class ImageSuite:

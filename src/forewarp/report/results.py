@@ -22,7 +22,7 @@ from typing import NamedTuple
 import yaml
 
 from forewarp.files import MOST_CONFIG, load_json, read_json, read_rows, read_text, replace_file
-from forewarp.metrics.registry import metric_of
+from forewarp.metrics.registry import metric_of, take_described
 from forewarp.report.statistics import Estimate
 
 Row = dict
@@ -267,6 +267,7 @@ def read_run(folder: Path) -> Row:
     config = yaml.safe_load(read_text(folder / "config.yaml", MOST_CONFIG))
     stages = {file.parent.name: load_json(file) for file in sorted(folder.glob("*/done.json"))}
     metrics = load_json(folder / "metrics.json") if (folder / "metrics.json").is_file() else {}
+    take_described(metrics.get("metrics"))
     measured_at = (folder / "metrics.json").stat().st_mtime_ns if metrics else 0
     plan = read_text(folder / "plan.yaml", MOST_CONFIG) if (folder / "plan.yaml").is_file() else "{}"
     points, images = read_points(folder), []

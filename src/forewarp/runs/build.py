@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import json
+import re
 import shlex
 from collections.abc import Callable
 from contextlib import suppress
-from functools import partial
+from functools import partial, reduce
 from pathlib import Path
 
 import torch
+from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
 from hydra.utils import get_object, instantiate
 from lightning.pytorch.profilers import AdvancedProfiler, SimpleProfiler
@@ -29,6 +32,8 @@ from forewarp.training.stages import Run
 
 PROFILERS = {"simple": SimpleProfiler, "advanced": AdvancedProfiler}  # Lightning's
 _LEVELS = 4  # that a run may lie below the folder of all runs
+_FOLLOWS = re.compile(r"\$\{([\w.]+)\}")  # one key that has the value of another one
+_PLACES = re.compile(r"data\.root|paths\.|trainer\.(accelerator|devices)")  # where, not what
 PROFILE = "profile"  # of a file's name: fit-profile.txt
 
 
@@ -134,28 +139,40 @@ def loggers_of(config: DictConfig) -> RunLoggers:
 
 
 def hyperparameters(config: DictConfig) -> dict[str, object]:
-    """List what makes a run what it is, by flat names and without paths, for the tables of its loggers.
+    """List what makes a run what it is, for the tables of its loggers: keys and values as they are typed.
 
-    A part of a method is named by its class: ``model.radiance: Grid``. ``_typed``, first in a sorted table,
-    holds the overrides of the command.
+    Each is there once: a key that follows another one stands there as that other one. Paths are left out.
+
+    ``command`` is the command without paths, ``sweeps`` the sweep that the run is a job of.
     """
-    typed = shlex.split(config.get("command") or "")[1:]
-    found: dict[str, object] = {"_typed": " ".join(o for o in typed if not TEXTS.fullmatch(key_of(o)))}
+    words = [word for word in shlex.split(config.get("command") or "") if not TEXTS.fullmatch(key_of(word))]
+    found: dict[str, object] = {"command": shlex.join(words)} if words else {}
+    if HydraConfig.initialized() and (sweep := HydraConfig.get().runtime.choices.get("sweeps")):
+        found["sweeps"] = sweep
+    unresolved = OmegaConf.to_container(config)
 
     def walk(value: object, name: str) -> None:
-        if isinstance(value, dict):
-            if "_target_" in value:
-                found[name] = str(value["_target_"]).rpartition(".")[2]
+        if isinstance(value, str) and (followed := _FOLLOWS.fullmatch(value)):
+            walk(reduce(lambda part, key: part[key], followed[1].split("."), unresolved), followed[1])
+        elif isinstance(value, dict):
             for key, inner in value.items():
-                if not key.startswith("_"):
+                # A stored config has copies of the objectives in place of what follows them.
+                copied = key == "objective" and inner == unresolved.get("objective", {}).get(name[6:])
+                if not copied and not (key.startswith("_") and (key != "_target_" or _is_fixed(inner))):
                     walk(inner, f"{name}.{key}")
-        elif name not in ("data.root", "trainer.accelerator", "trainer.devices"):
-            found[name] = value if isinstance(value, bool | int | float | str) else str(value)
+        elif not _PLACES.match(name) and not OmegaConf.is_missing(config, name):
+            value = plain(OmegaConf.select(config, name))
+            found[name] = value if isinstance(value, bool | int | float | str) else json.dumps(value)
 
     for key in (*IDENTITY, "capture", "variant", "threads", "trainer"):
-        if (value := config.get(key)) is not None:
-            walk(plain(value), key)
+        if unresolved.get(key) is not None:
+            walk(unresolved[key], key)
     return found
+
+
+def _is_fixed(target: object) -> bool:
+    """Tell whether a class is one that every run has in its place."""
+    return str(target).startswith(("forewarp.training.", "lightning."))
 
 
 def model_of(config: DictConfig) -> Callable:

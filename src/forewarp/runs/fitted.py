@@ -294,11 +294,22 @@ def measure_run(run: Run, module: DynamicSceneModule, config: DictConfig) -> dic
 
 
 def log_scores(run: Run, metrics: dict) -> None:
-    """Log the scores of ``metrics.json`` to the run's loggers, as ``test/space/psnr``."""
-    kinds = metrics["test"].items()
+    """Log what ``metrics.json`` says of a run to its loggers; see ``scores_to_log``."""
+    run.loggers.log_scores(scores_to_log(metrics), sum(done["steps"] for done in run.finished().values()))
+
+
+def scores_to_log(metrics: dict) -> dict[str, float]:
+    """Name the scores of ``metrics.json`` for trackers: ``test/space/psnr``, and what they cost.
+
+    ``docs/sweeps.md`` says what each name means, and in which unit. What a run has not is left out.
+    """
+    kinds, seconds = metrics["test"].items(), metrics["seconds"]
     scores = {f"test/{kind}/{name}": score for kind, of in kinds for name, score in of.items()}
-    scores |= {"test/seconds": sum(metrics["seconds"].values())}
-    run.loggers.log_scores(scores, sum(done["steps"] for done in run.finished().values()))
+    scores |= {"test/flow/epe_moving": metrics.get("flow", {}).get("epe_moving")}
+    scores |= {"test/keypoints/pck_t": metrics.get("keypoints", {}).get("pck_t")}
+    scores |= {"test/seconds_training": seconds["train"], "test/seconds_image": seconds["render_per_frame"]}
+    scores |= {f"test/{name}": metrics[name] for name in ("peak_memory_bytes", "parameters")}
+    return {name: float(score) for name, score in scores.items() if score is not None}
 
 
 def method_name(config: DictConfig) -> str:
