@@ -456,3 +456,11 @@ def test_colours_are_those_that_the_tags_or_else_the_size_tell(tmp_path, size, w
     film = write_planes(tmp_path / "a.mkv", planes.astype(np.uint8), "yuv444p", *lossless)
     (image,) = extracted(film, [1], None)
     assert np.abs(image - rgb).mean() < 2
+
+
+def test_missing_images_leave_a_gap_in_time(tmp_path):
+    folder = quarter(tmp_path / "p", count=4)
+    (folder / "2.jpg").rename(folder / "9.jpg")
+    frames = taken(tmp_path, folder)
+    assert list(frames.times.values()) == pytest.approx([0, 1 / 9, 3 / 9, 1])
+    assert frames.assumed.endswith("times: taken from the numbers in the images' names, 0 to 9")

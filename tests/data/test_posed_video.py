@@ -537,3 +537,14 @@ def test_moments_number_instants_of_cameras_with_times_of_their_own(tmp_path):
     assert {seen.moment.frame for seen in sampler.draw().observations} == {0, 1}
     with refused(r"data.test_moments: expected numbers of 0 to 2, not all"):
         read_scene(tmp_path, "toy", test_moments=[3])
+
+
+def test_a_pattern_reads_times_and_cameras_in_names(tmp_path):
+    black = np.zeros((20, 30, 3), np.uint8)
+    shots = [PosedShot(f"{n % 2}_{n // 2}.png", posed_cameras(2)[n % 2], black) for n in range(8)]
+    write_scene(tmp_path / "toy", shots, near=20.0, far=120.0)
+    options = {"name_pattern": r"(?P<camera>\d)_(?P<frame>\d)$", "test_cameras": ["1"]}
+    scene = read_scene(tmp_path, "toy", **options)
+    assert [frame.time for frame in scene.test] == pytest.approx([0, 1 / 3, 2 / 3, 1])
+    assert all("1_" in frame.name for frame in scene.test)
+    assert scene.protocol["times"] == "from the images' names"

@@ -134,7 +134,6 @@ def test_a_vertical_angle_that_is_none_is_told_and_never_refused(angle):
         (["7.500000", "8.000000", "9.500000"], [0, 0.25, 1]),
         (["PXL_20240501_235959500", "PXL_20240502_000000500", "PXL_20240502_000003500"], [0, 0.25, 1]),
         (["frame_00001_0", "frame_00001_1", "frame_00003_0", "frame_00003_1"], [0, 0, 1, 1]),  # faces
-        (["1.0001", "1.0002", "2.0001", "2.0002"], [0, 1, 0, 1]),  # camera and frame
     ],
 )
 def test_times_that_a_file_does_not_tell_are_in_the_names(names, times):
@@ -255,9 +254,10 @@ def test_times_under_another_key_are_named(tmp_path):
     folder = write_dnerf(tmp_path / "toy")
     for file in folder.glob("*.json"):
         edit(file, lambda c: [f.update(timestamp=f.pop("time")) for f in c["frames"]])
-    lines = dnerf.read_scene(tmp_path, "toy").protocol["assumed"]
+    pattern = r"(?P<camera>\w+)/r_(?P<frame>\d+)"
+    lines = dnerf.read_scene(tmp_path, "toy", name_pattern=pattern).protocol["assumed"]
     assert f"{folder}/transforms_train.json: timestamp of the frames is not read; call it" in lines[0]
-    assert "taken from the numbers in the images' names" in lines[-1]
+    assert "taken from the images' names by data.name_pattern" in lines[-1]
 
 
 def test_what_is_not_there_is_left_out_and_told(tmp_path):

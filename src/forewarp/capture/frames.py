@@ -9,6 +9,7 @@ import math
 import re
 import shutil
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import nullcontext, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -17,9 +18,9 @@ import numpy as np
 import torch
 from torch.nn.functional import adaptive_max_pool2d, interpolate
 
-from forewarp.data.files import UNREAD, mismatch
-from forewarp.data.images import SUFFIXES, bright, by, common_header, in_order, read_image, write_image
-from forewarp.data.transforms import times_of
+from forewarp.data.files import UNREAD, SceneError, mismatch
+from forewarp.data.images import SUFFIXES, bright, by, common_header, read_image, write_image
+from forewarp.data.names import in_order, read_names
 from forewarp.data.video import HDR, Log, decode, deinterlacing, extracted, hdr_of, hdr_unsaid
 from forewarp.drawing.images import at_most
 from forewarp.files import read_json, write_json
@@ -55,7 +56,8 @@ _DAMAGE = re.compile("partial file|ended prematurely|corrupt")
 class Source:
     """What to capture: a ``video``, or a folder of ``images``, with ``colmap`` poses that are known; a folder
     of ``masks`` of what moves; and ``size``, the most pixels of the longer side, None: as they are. With
-    poses that are known images are left as stored.
+    poses that are known images are left as stored. ``name_pattern`` reads the images' names: see
+    ``names.read_names``.
     """
 
     video: Path | None = None
@@ -63,6 +65,7 @@ class Source:
     colmap: Path | None = None
     masks: Path | None = None
     size: int | None = 1600
+    name_pattern: str | None = None
 
     @property
     def path(self) -> Path:
@@ -232,10 +235,10 @@ def frames_for(speeds: np.ndarray) -> tuple[int, str]:
 
 
 def _from_folder(folder: Path, source: Source, step: Step) -> dict:
-    """Copy images; times are even, in the order of the names.
+    """Copy images; times are the numbers in their names, or even in the order of these.
 
-    Without known poses all have one size. With them, images may lie in subfolders, and those of several
-    cameras share a time where folders or names tell so: see ``transforms.times_of``.
+    Without known poses all have one size and are of one camera. With them, images may lie in subfolders, and
+    those of several cameras share a time where folders or names tell so: see ``names.read_names``.
 
     The copies have names of ours: COLMAP's list of pairs has no place for a space, and what comes later sorts
     plainly. Alpha is kept where all images have it.
@@ -246,13 +249,15 @@ def _from_folder(folder: Path, source: Source, step: Step) -> dict:
         got = f"{len(paths)} PNG or JPEG files" if paths else "none"
         raise mismatch(source.images, "a folder of many pictures, PNG or JPEG", got)
     rows = {path: row for row, path in enumerate(paths)}
-    numbers, assumed = rows, None
-    if as_stored:
-        names = [path.relative_to(source.images).with_suffix("").as_posix() for path in paths]
-        times, told = times_of(names, [None] * len(names), str(source.images))
-        if len({*times}) < len(times) or any(path.parent != source.images for path in paths):
-            numbers, assumed = dict(zip(paths, times)), told
-            paths.sort(key=numbers.get)
+    names = [path.relative_to(source.images).with_suffix("").as_posix() for path in paths]
+    where, read, numbers = source.images, None, rows
+    assumed = f"{where}: times are even, in the order of the images' names"
+    # Images of one camera have an order, whatever else their names may say.
+    with nullcontext() if as_stored or source.name_pattern is not None else suppress(SceneError):
+        read = read_names(names, str(where), source.name_pattern)
+    if read is not None and (as_stored or len({*read.frames}) == len(paths)):
+        numbers, assumed = dict(zip(paths, read.times)), f"{where}: times: {read.told}"
+        paths.sort(key=numbers.get)
     has_alpha = common_header(paths, one_size=not as_stored).has_alpha
     widths, originals, sizes, times, first, brightest = [], {}, {}, {}, None, 0
     with step("reading pictures") as progress:
@@ -277,7 +282,7 @@ def _from_folder(folder: Path, source: Source, step: Step) -> dict:
                 brightest = np.maximum(brightest, pixels[..., :3].max(-1))
             progress(done, len(paths))
     if not as_stored:
-        assumed = _told(bars_of(brightest), "stay: crop the pictures")
+        assumed = _told(bars_of(brightest), "stay: crop the pictures") or assumed
     in_turn = [rows[path] for path in paths]
     return _record(times, in_turn, len(paths), widths, sizes, originals, assumed=assumed)
 

@@ -40,8 +40,8 @@ from forewarp.capture.poses import Reconstruction, Search
 from forewarp.capture.sync import MOST as HEARD
 from forewarp.capture.sync import RATE, Synchrony, is_silent, synchronise
 from forewarp.data.files import mismatch, number
-from forewarp.data.images import by, in_order, read_image, write_image
-from forewarp.data.transforms import numbers_in
+from forewarp.data.images import by, read_image, write_image
+from forewarp.data.names import in_order, read_names
 from forewarp.data.video import VIDEOS, extracted, sound_of, stamps_of, start_of
 from forewarp.drawing.images import write_png
 from forewarp.files import folder_written_whole, read_json, write_json
@@ -134,13 +134,16 @@ def cameras_in(folder: Path) -> dict[str, Path]:
     return {name: found[name] for name in in_order(found)}
 
 
-def recordings(folder: Path, rate: float | None, without: Sequence[str] = ()) -> list[Recording]:
+def recordings(
+    folder: Path, rate: float | None, without: Sequence[str] = (), name_pattern: str | None = None
+) -> list[Recording]:
     """Look at what each camera of a rig took.
 
     Args:
         folder: see ``cameras_in``.
         rate: images a second of sub-folders; None: their times are numbers.
         without: names of cameras to leave out, which are not looked at.
+        name_pattern: reads the names of images in sub-folders, see ``names.read_names``.
 
     Raises:
         ValueError: for fewer than two, for what is no video, and for a name to leave out that is not there.
@@ -150,14 +153,15 @@ def recordings(folder: Path, rate: float | None, without: Sequence[str] = ()) ->
     used = [name for name in found if name not in without]
     if len(used) < 2:
         raise mismatch("without", "at least two cameras left", f"{len(used)} of {len(found)}")
-    return [_recording(name, found[name], rate) for name in used]
+    return [_recording(name, found[name], rate, name_pattern) for name in used]
 
 
-def _recording(name: str, path: Path, rate: float | None) -> Recording:
+def _recording(name: str, path: Path, rate: float | None, name_pattern: str | None) -> Recording:
     images = ()
     if path.is_dir():
         images = tuple(images_in(path))
-        numbers = numbers_in([image.stem for image in images]) or range(len(images))
+        read = read_names([image.stem for image in images], str(path), name_pattern)
+        numbers = range(len(images)) if read is None else read.frames
         stamps = np.array(numbers, dtype=np.float64) / (rate or 1.0)
         order = np.argsort(stamps, kind="stable")
         images, stamps = tuple(images[row] for row in order), stamps[order]
@@ -364,6 +368,7 @@ def capture_rig(
     without: Sequence[str] = (),
     fixed: bool | None = None,
     rate: float | None = None,
+    name_pattern: str | None = None,
     frames: int | None = None,
     size: int | None = 1600,
     force: bool = False,
@@ -378,6 +383,7 @@ def capture_rig(
         without: names of cameras to leave out.
         fixed: whether the cameras stand; None: as the images of each show.
         rate: images a second, of folders of images.
+        name_pattern: see ``recordings``.
         frames: of each camera; None: see ``choose``.
         force: go on without cameras that see nothing of the others.
 
@@ -387,8 +393,9 @@ def capture_rig(
     without = [str(name) for name in without]  # a name of digits is read as a number
     if isinstance(offsets, Mapping):
         offsets = {str(name): seconds for name, seconds in offsets.items()}
-    everyone, films = list(cameras_in(folder)), recordings(folder, rate, without)
+    everyone, films = list(cameras_in(folder)), recordings(folder, rate, without, name_pattern)
     about = {"videos": folder, "masks": masks, "fixed": fixed, "rate": rate, "frames": frames, "size": size}
+    about |= {"name_pattern": name_pattern} if name_pattern is not None else {}
     with work_for(out, search, (folder, masks), **about, offsets=offsets) as folder_of_work:
         work = _Work(folder_of_work, masks, size, search.threads)
         is_timed = rate is not None or not films[0].images

@@ -10,6 +10,7 @@ What one types most:
                                 Record3D (.r3d) has poses and measured depth of its own
   videos=FOLDER                 or a video of each of several cameras, which film one scene (see below)
   images=FOLDER                 or pictures of one size, in the order of their names
+  name_pattern='(?P<frame>[0-9]+)$'  reads frame or time in pictures' names that say it in several ways
   colmap=FOLDER                 poses that are known: a COLMAP model, of the pictures in images=
   masks=FOLDER                  what moves is bright; poses are not found from it. A mask for each frame
                                 of the video in order, or masks with the pictures' names
@@ -72,10 +73,11 @@ def capture(config) -> None:
         facts = record3d.capture_record3d(source["video"], out, Counted, ABOUT, config.frames)
         lines = record3d.summary(facts)
     elif videos is None:
-        facts = capture(Source(**source, size=config.size), out, search, Counted, **options)
+        of = Source(**source, size=config.size, name_pattern=config.name_pattern)
+        facts = capture(of, out, search, Counted, **options)
         lines = scene.summary(facts)
     else:
-        options |= OmegaConf.to_container(OmegaConf.masked_copy(config, ["size", *RIG]))
+        options |= OmegaConf.to_container(OmegaConf.masked_copy(config, ["size", "name_pattern", *RIG]))
         facts = rig.capture_rig(videos, out, search, Counted, masks=source["masks"], **options)
         lines, posed = rig.summary(facts), [name for name in facts["cameras"] if name not in facts["lost"]]
         # One in the middle, as the outermost see what no other does.

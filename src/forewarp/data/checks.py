@@ -11,7 +11,7 @@ from torch import Tensor
 from forewarp.data.cameras import nine_pixels
 from forewarp.data.directions import common_point
 from forewarp.data.files import mismatch
-from forewarp.data.images import in_order
+from forewarp.data.names import in_order
 from forewarp.scene.box import Box, Lattice
 from forewarp.scene.camera import Camera, focus_point
 from forewarp.scene.frame import Frame, Scene, sightings, spread, walk_of, where_seen

@@ -93,6 +93,7 @@ def read_scene(
     inverse: bool = False,
     angle: str = "width",
     test_every: int = 8,
+    name_pattern: str | None = None,
     alpha: str | None = None,
 ) -> Scene:
     """Read ``root/scene``; pixels are decoded when a frame is first loaded.
@@ -111,6 +112,7 @@ def read_scene(
         axes, inverse: of the poses in the files, see ``posed_video.read_scene``.
         angle: ``camera_angle_x`` is that of the ``width`` or of the ``longer`` side.
         test_every: every n-th training image is tested on where there are no test images.
+        name_pattern: see ``posed_video.read_scene``.
         alpha: colours are ``straight`` or ``premultiplied``; None: as the edges of some images show.
 
     Raises:
@@ -121,7 +123,7 @@ def read_scene(
     one_of(half_resolution, "data.half_resolution", True, False, "auto")
     folder = scene_folder(root, scene, "D-NeRF")
     every = whole(test_every, "data.test_every", 2)
-    records, assumed = _read_records(folder, axes, inverse, angle == "longer", every)
+    records, assumed = _read_records(folder, axes, inverse, angle == "longer", every, name_pattern)
     everything = [record for split in records.values() for record in split]
     size, has_alpha = _common(everything)
     halve = size[0] > _PUBLISHED_WIDTH if half_resolution == "auto" else bool(half_resolution)
@@ -196,7 +198,12 @@ def _common(records: Sequence[_Record]) -> tuple[tuple[int, int], bool]:
 
 
 def _read_records(
-    folder: Path, axes: str | None, inverse: bool, longer: bool, test_every: int
+    folder: Path,
+    axes: str | None,
+    inverse: bool,
+    longer: bool,
+    test_every: int,
+    name_pattern: str | None,
 ) -> tuple[dict[str, list[_Record]], list[str]]:
     """Read the records of all splits, each with a time; also say in lines what was assumed."""
     records, assumed = {}, []
@@ -208,7 +215,8 @@ def _read_records(
         assumed += [line for _, lines in parts for line in lines]
     everything = [record for split in SPLITS for record in records[split]]
     names = [_name(folder, record) for record in everything]
-    times, told = times_of(names, [record.time for record in everything], str(folder))
+    centers = [record.camera.center.tolist() for record in everything]
+    times, told = times_of(names, [record.time for record in everything], str(folder), name_pattern, centers)
     assumed += [told] if told else []
     given = {split: {_name(folder, record): record.time for record in records[split]} for split in SPLITS}
     check_times(given, str(folder))

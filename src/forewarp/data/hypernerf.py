@@ -19,6 +19,7 @@ unscaled world; all else is in pixels of the full-size image. Old files say ``ta
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from reprlib import repr as short
@@ -32,18 +33,28 @@ from forewarp.data.arrays import read_cloud, read_truth, write_array, write_trut
 from forewarp.data.cameras import MOST_UNITS, Normalisation, box_of, check_camera, frustum_box, pose_of
 from forewarp.data.depth import SensedDepth, depths_beside, unit_of
 from forewarp.data.directions import by_translation, opposite, other_readings, transposed
-from forewarp.data.files import Entry, inside, mismatch, number, read_json, remove, scene_folder, whole
+from forewarp.data.files import (
+    Entry,
+    SceneError,
+    inside,
+    mismatch,
+    number,
+    read_json,
+    remove,
+    scene_folder,
+    whole,
+)
 from forewarp.data.images import (
     MovingMask,
     StoredImage,
     StoredMask,
     check_pixels,
     exif_turned,
-    in_order,
     inspect_image,
     write_image,
 )
-from forewarp.data.transforms import check_pinhole, check_times, numbers_in, with_images, with_suffix
+from forewarp.data.names import in_order, read_names
+from forewarp.data.transforms import check_pinhole, check_times, with_images, with_suffix
 from forewarp.files import write_json
 from forewarp.scene.camera import Camera, Lens
 from forewarp.scene.frame import Frame, Scene, Truth, middle_of
@@ -386,7 +397,10 @@ def _read_items(path: Path, ids: list[str]) -> tuple[dict[str, int], dict[str, i
     moments, cameras = {item: counted(entry, key) for item, entry in entries.items()}, dict.fromkeys(ids)
     having = {item: entry for item, entry in entries.items() if entry.get("camera_id") is not None}
     cameras |= {item: counted(entry, "camera_id") for item, entry in having.items()}
-    named = dict(zip(ids, numbers_in(ids) or []))
+    read = None
+    with suppress(SceneError):  # names that do not tell are no help
+        read = read_names(ids, str(path))
+    named = dict(zip(ids, read.frames)) if read else {}
     if key == "time_id" or not _counts_items(moments, named, cameras):
         return moments, cameras, []
     said = "counts the items of one camera after the other: times are the numbers in their names"

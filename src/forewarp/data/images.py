@@ -5,13 +5,11 @@ from __future__ import annotations
 import io
 import mmap
 import os
-import re
 import warnings
 import weakref
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from datetime import datetime, timezone
 from pathlib import Path
 from typing import BinaryIO
 
@@ -50,10 +48,6 @@ _FOREGROUND = 127  # a mask above it is foreground; masks are lossy, so never qu
 _COLORED = 32  # of 255: difference of channels of a mask with colours; all of a DAVIS palette are as bright
 _OWN_PAGES = 1 << 20  # bytes of a kept tensor from which it has pages of its own
 _NUMBERED = 15  # a mask nowhere above it holds numbers of objects
-# A number in a name; seconds, as of TUM's data or ROS, are Unix time, or fill the name to the microsecond.
-_NUMBER = r"((?<!\d)\d{9,10}\.\d+|(?<![^/])\d+\.(?:\d{6}|\d{9})(?=$|\.[A-Za-z])|\d+)"
-# Date and time of day, with or without thousandths of a second, as phones name pictures.
-_DATED = re.compile(r"(?<!\d)((?:19|20)\d{6})[_-]?(\d{6})(\d{3})?(?!\d)")
 
 
 class ImageCache:
@@ -512,36 +506,3 @@ def by(size: Iterable[int]) -> str:
     '640 x 480'
     """
     return " x ".join(map(str, size))
-
-
-def in_order(things: Iterable, name: Callable[..., str] = str) -> list:
-    """Sort things by their names, numbers within them by value.
-
-    >>> in_order(["b2", "b10", "a"])
-    ['a', 'b2', 'b10']
-    """
-    return sorted(things, key=lambda thing: name_parts(name(thing)))
-
-
-def _seconds(found: re.Match) -> str:
-    """Write date and time of day as seconds since 1970; other digits stay as they are."""
-    day, clock, thousandths = found.groups()
-    try:
-        moment = datetime.strptime(day + clock, "%Y%m%d%H%M%S").replace(tzinfo=timezone.utc)
-    except ValueError:
-        return found[0]
-    return f"{int(moment.timestamp())}.{thousandths or '000'}000"
-
-
-def name_parts(name: str) -> list[str | float]:
-    """Split a name into text, at even places, and numbers; seconds such as 1305031102.1753 are one number,
-    and so are date and time of day, as phones write them.
-
-    >>> name_parts("cam1/007"), name_parts("rgb/1305031102.1753"), name_parts("12.345678.png")
-    (['cam', 1, '/', 7, ''], ['rgb/', 1305031102.1753, ''], ['', 12.345678, '.png'])
-    >>> name_parts("PXL_20240501_235959500"), name_parts("IMG_20240502_000000")
-    (['PXL_', 1714607999.5, ''], ['IMG_', 1714608000.0, ''])
-    """
-    parts = re.split(_NUMBER, _DATED.sub(_seconds, name))
-    parts[1::2] = (float(part) if "." in part else int(part) for part in parts[1::2])
-    return parts

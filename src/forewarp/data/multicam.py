@@ -25,7 +25,8 @@ from forewarp.data.cameras import MOST_UNITS, box_of, number_or_none, pose_of, s
 from forewarp.data.directions import inverted, refuse_other_readings
 from forewarp.data.files import mismatch, number, one_of, scene_folder, whole
 from forewarp.data.films import STORE, Film
-from forewarp.data.images import CACHE, SUFFIXES, TURN, StoredImage, by, exif_turned, in_order, inspect_image
+from forewarp.data.images import CACHE, SUFFIXES, TURN, StoredImage, by, exif_turned, inspect_image
+from forewarp.data.names import in_order
 from forewarp.data.rigs import held_cameras, held_moments, split_rig
 from forewarp.data.video import VIDEOS, extracted, stamps_of
 from forewarp.files import written_whole

@@ -49,10 +49,10 @@ from forewarp.data.images import (
     by,
     check_pixels,
     hides_image,
-    in_order,
     inspect_image,
     write_image,
 )
+from forewarp.data.names import in_order, read_names
 from forewarp.data.rigs import held_cameras, held_moments, split_rig
 from forewarp.data.transforms import ListedImage, check_times, hold_out_every, image_of, read_frames, times_of
 from forewarp.files import write_json
@@ -98,6 +98,7 @@ def read_scene(
     box: Sequence[float] | None = None,
     normalise: bool = True,
     test_every: int = 8,
+    name_pattern: str | None = None,
     test_cameras: Sequence[str | int] | None = None,
     test_moments: Sequence[int] | None = None,
     axes: str | None = None,
@@ -113,7 +114,7 @@ def read_scene(
     The subject is cut out where masks are alpha, or where some image has a pixel that is not opaque: images
     with an alpha channel are decoded until one such is found.
 
-    Without ``time`` in the file, numbers in the images' names tell it; see ``transforms.times_of``. Frames
+    Without ``time`` in the file, numbers in the images' names tell it; see ``names.read_names``. Frames
     without an image are left out and counted.
 
     Args:
@@ -123,6 +124,8 @@ def read_scene(
         normalise: put what is looked at into the origin and the farthest camera at distance 1.
         test_every: every n-th frame is a test frame, the first and the last never, where the file does not
             list ``<split>_filenames``.
+        name_pattern: regular expression that reads ``time`` or ``frame``, and ``camera``, in the images'
+            names; None: the file's times, or what names say in one way.
         test_cameras: names of the cameras held out, of frames that have ``camera``; None: see above.
         test_moments: numbers of the frames' moments, or without these of the times, from 0, that no camera
             is trained on; None: see above.
@@ -159,7 +162,12 @@ def read_scene(
     assumed += told
     for load in cut_out:  # none is decoded yet
         load.premultiplied = premultiplied
-    times, told = times_of([entry.name for entry in entries], [entry.time for entry in entries], str(file))
+    names = [entry.name for entry in entries]
+    centers = [entry.camera.center.tolist() for entry in entries]
+    times, told = times_of(names, [entry.time for entry in entries], str(file), name_pattern, centers)
+    if name_pattern is not None and all(entry.taken_by is None for entry in entries):
+        cameras = read_names(names, str(file), name_pattern).cameras or [None] * len(names)
+        entries = [replace(entry, taken_by=camera) for entry, camera in zip(entries, cameras)]
     given = {entry.name: entry.time for entry in entries}
     entries = [replace(entry, time=time) for entry, time in zip(entries, times)]
     entries.sort(key=lambda entry: entry.time)
@@ -225,6 +233,7 @@ def read_scene(
         train, test = split_rig(((moments[f.name], f) for f in train), *held)
     if not isinstance(moving_from := content.get("moving_from", "moving_path of the frames"), str):
         raise mismatch(f"{file}: moving_from", "text", short(moving_from))
+    is_given = name_pattern is None and given[entries[0].name] is not None
     start = middle_of(frame.time for frame in train)
     count, rigged = sum(f.load_sensed is not None for f in train), by_name or None
     ignored = "ignore: PSNR is of the pixels that count, other metrics see the true colour elsewhere"
@@ -236,7 +245,7 @@ def read_scene(
     protocol = {
         "dataset": "video_with_poses",
         "resolution": [train[0].camera.width, train[0].camera.height],
-        "times": "as given" if given[entries[0].name] is not None else "from the images' names",
+        "times": "as given" if is_given else "from the images' names",
         "split": how,
         "test_frames": len(test),
         "normalisation": space.told,

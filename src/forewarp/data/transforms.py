@@ -22,7 +22,8 @@ import torch
 
 from forewarp.data.cameras import FLIP, check_camera, pose_of
 from forewarp.data.files import Entry, frames_of, mismatch, nearly, one_of
-from forewarp.data.images import SUFFIXES, TURN, Header, by, exif_turned, in_order, inspect_image, name_parts
+from forewarp.data.images import SUFFIXES, TURN, Header, by, exif_turned, inspect_image
+from forewarp.data.names import LEAST_SPAN, in_order, read_names, refuse_far
 from forewarp.ops.backend import is_number
 from forewarp.scene.camera import Camera, Lens
 
@@ -42,11 +43,8 @@ _SAME_FOCAL = 0.02  # share by which two focal lengths of one camera may differ
 _OUTSIDE = 0.9  # share of a side beyond which a principal point is another image's
 _TIMES = ("timestamp", "time_stamp", "frame_time", "time_id", "t", "frame_id", "frame")  # of programs
 _MOST_TIME = 1e20
-_LEAST_SPAN, _MOST_FAR = 0.05, 0.1  # of all times: less is hardly what was meant; share that may be wrong
 _LEAST_UNIT = 0.5  # of all times, that those in [0, 1] span
 _ROUNDING = 1e-6  # beyond 0 and 1
-_FRAME_WORD = re.compile(r"frame[_-]?$", re.IGNORECASE)
-_CAMERA_WORDS = re.compile(r"(cam|camera|view|sensor|c|v)[_-]?$", re.IGNORECASE)
 
 
 @dataclass(frozen=True)
@@ -358,23 +356,30 @@ def with_images(things: Sequence[Thing], images: Sequence[Path], where: str) -> 
     return [thing for thing, is_there in zip(things, there) if is_there], [line]
 
 
-def times_of(names: list[str], times: Sequence[float | None], where: str) -> tuple[list[float], str | None]:
+def times_of(
+    names: list[str],
+    times: Sequence[float | None],
+    where: str,
+    pattern: str | None = None,
+    centers: Sequence[Sequence[float]] | None = None,
+) -> tuple[list[float], str | None]:
     """Give each image a time in [0, 1], where the file has none by the numbers in the images' names.
 
-    Where folders or names tell several cameras apart, images of one number share a time. Times in the file
-    that are not all in [0, 1], such as milliseconds or numbers of frames, are scaled to it.
+    Images of several cameras with one number share a time. Times in the file that are not all in [0, 1], such
+    as milliseconds or numbers of frames, are scaled to it.
 
     Args:
         names: paths of the images without suffix, ``cam01/0003``; of all splits together.
         times: what the file says.
         where: the file, for errors.
+        pattern, centers: see ``names.read_names``; with a pattern names win over the file.
 
     Returns:
         the times, and a line that says what was assumed; None if the file has all times, in [0, 1] and well
         spread.
 
     Raises:
-        SceneError: if only some images have a time.
+        SceneError: if only some images have a time, or names can be read in two ways.
 
     >>> times_of(["a/0001", "a/0003", "b/0001", "b/0003"], [None] * 4, "t.json")[0]
     [0.0, 1.0, 0.0, 1.0]
@@ -382,7 +387,7 @@ def times_of(names: list[str], times: Sequence[float | None], where: str) -> tup
     ([0.0, 0.5, 1.0], 't.json: all times lie from 300 to 500: taken as 0 to 1')
     """
     given = [time is not None for time in times]
-    if all(given):
+    if pattern is None and all(given):
         first, last = min(times), max(times)
         span = f"{where}: all times lie from {first:.10g} to {last:.10g}"
         if not _within_unit(times):
@@ -390,20 +395,17 @@ def times_of(names: list[str], times: Sequence[float | None], where: str) -> tup
             return [(time - first) / (length or 1) for time in times], f"{span}: {taken}"
         line = f"{span}, where 0 to 1 is the whole sequence"
         times = [min(max(time, 0.0), 1.0) for time in times]
-        return times, line if len(times) > 1 and last - first < _LEAST_SPAN else None
-    if any(given):
+        return times, line if len(times) > 1 and last - first < LEAST_SPAN else None
+    if pattern is None and any(given):
         got = f"{sum(given)} of {len(given)}, and none for {names[given.index(False)]}"
         raise mismatch(f"{where}: frames: time", "one in all frames or in none", got)
-    numbers = numbers_in(names)
-    if numbers is None:
+    why = "times in the frames are not read" if any(given) else "no time in the frames"
+    read = read_names(names, where, pattern, centers)
+    if read is None:
         order, last = in_order(range(len(names)), lambda i: names[i]), max(len(names) - 1, 1)
-        line = f"{where}: no time in the frames: spread evenly in the order of the images' names"
+        line = f"{where}: {why}: spread evenly in the order of the images' names"
         return [rank / last for rank in np.argsort(order).tolist()], line
-    first, last = min(numbers), max(numbers)
-    line = f"{where}: no time in the frames: taken from the numbers in the images' names, {first} to {last}"
-    if len(set(numbers)) < len(numbers):
-        line += "; images of one number share a time"
-    return [(number - first) / ((last - first) or 1) for number in numbers], line
+    return read.times, f"{where}: {why}: {read.told}"
 
 
 def check_times(splits: Mapping[str, Mapping[str, float | None]], where: str) -> None:
@@ -425,16 +427,10 @@ def check_times(splits: Mapping[str, Mapping[str, float | None]], where: str) ->
     whole = times[-1] - times[0]
     advice = "write all times in one unit, or from 0 to 1"
 
-    def is_squeezed(some: Iterable[float], least: float = _LEAST_SPAN) -> bool:
+    def is_squeezed(some: Iterable[float], least: float = LEAST_SPAN) -> bool:
         return len({*some}) > 2 and max(some) - min(some) < least * whole
 
-    middle = times[len(times) // 2]
-    *rest, far = sorted(times, key=lambda time: abs(time - middle))
-    rest = rest[: len(times) - max(1, int(_MOST_FAR * len(times)))]
-    if is_squeezed(rest):
-        name = next(name for name, time in named.items() if time == far)
-        expected = f"a time near all others, {min(rest):.10g} to {max(rest):.10g}"
-        raise mismatch(f"{where}: time of {name}", expected, f"{far:.10g}", advice)
+    refuse_far(named, where, "time", advice)
     for split, of in splits.items():
         some = of.values()
         in_unit = _within_unit(some)
@@ -447,25 +443,3 @@ def check_times(splits: Mapping[str, Mapping[str, float | None]], where: str) ->
 def _within_unit(times: Iterable[float]) -> bool:
     """Tell whether all times lie in [0, 1], but for rounding."""
     return all(-_ROUNDING <= time <= 1 + _ROUNDING for time in times)
-
-
-def numbers_in(names: Sequence[str]) -> list[float] | None:
-    """Return each name's frame number, or its seconds; None where names do not tell."""
-    parts = [name_parts(name) for name in names]
-    if len({len(part) for part in parts}) > 1:
-        parts = [part[-3:] if len(part) >= 3 else part for part in parts]  # folders may be called differently
-        if any(len(part) < 3 for part in parts):
-            return None
-    places = [i for i in range(1, len(parts[0]), 2) if len({part[i] for part in parts}) > 1]
-    frames = [i for i in places if not all(_CAMERA_WORDS.search(part[i - 1]) for part in parts)]
-    if not frames:
-        return None
-    named = [i for i in frames if all(_FRAME_WORD.search(part[i - 1]) for part in parts)]
-    place = (named or frames)[-1]
-    numbers = [part[place] for part in parts]
-    others = [
-        tuple(name.split("/")[:-1]) + tuple(p for i, p in enumerate(part) if i != place)
-        for name, part in zip(names, parts)
-    ]
-    # Of one camera no number may come twice, or it is no frame's.
-    return numbers if len({*zip(others, numbers)}) == len(names) else None

@@ -1,0 +1,367 @@
+"""Read times and cameras from the names of images, or refuse names that can be read in two ways."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from datetime import datetime, timezone
+from statistics import median
+from typing import NamedTuple
+
+import numpy as np
+
+from forewarp.data.files import mismatch
+
+KEY = "set data.name_pattern (of forewarp-capture: name_pattern) to a regular expression with a group"
+KEY += " 'frame' or 'time', and 'camera' for a rig"
+# A number in a name; seconds, as of TUM's data or ROS, are Unix time, or fill the name to the microsecond.
+_NUMBER = r"((?<!\d)\d{9,10}\.\d+|(?<![^/])\d+\.(?:\d{6}|\d{9})(?=$|\.[A-Za-z])|\d+)"
+# Date and time of day, with or without thousandths of a second, as phones and screenshots name images.
+_DATED = re.compile(
+    r"(?<!\d)((?:19|20)\d\d)([-_.]?)(\d\d)\2(\d\d)[-_ T.]?(\d\d)([-_.:]?)(\d\d)\6(\d\d)(?:\.?(\d{3}))?(?!\d)"
+)
+_SECONDS_NANOSECONDS = re.compile(r"(?<!\d)(\d{9,10})[_-](\d{9})(?!\d)")
+_FRAME_WORD = re.compile(r"(?i)(?:^|[^a-z])(frame|time|t)[_-]?$")
+_CAMERA_WORD = re.compile(r"(?i)(?:^|[^a-z])(cam|camera|view|sensor|c|v)[_-]?$")
+_ODD = 0.2  # share of the names that may have another form than all others, and are then named in the error
+_SAME_FRAMES = 0.8  # share of all frame numbers that each camera must have where no word tells the camera
+_SPAN = 0.8  # share of the whole sequence that each camera's, or each split's, frame numbers must span
+_COUNTER_DIGITS = 4  # from which a counter may begin anew after its last number
+_ONE_PATH, _JUMPS = 3.0, 8.0  # steps from camera to camera, in steps of one camera: at most, at least
+_STEP = 0.3  # of all positions' extent: longer steps are no path's
+LEAST_SPAN, _MOST_FAR = 0.05, 0.1  # of all times: less is hardly what was meant; share that may be wrong
+
+
+def in_order(things: Iterable, name: Callable[..., str] = str) -> list:
+    """Sort things by their names, numbers within them by value.
+
+    >>> in_order(["b2", "b10", "a"])
+    ['a', 'b2', 'b10']
+    """
+    return sorted(things, key=lambda thing: name_parts(name(thing)))
+
+
+def name_parts(name: str) -> list[str | float]:
+    """Split a name into text, at even places, and numbers; seconds such as 1305031102.1753 are one number,
+    and so are date and time of day, as phones write them.
+
+    >>> name_parts("cam1/007"), name_parts("rgb/1305031102.1753"), name_parts("12.345678.png")
+    (['cam', 1, '/', 7, ''], ['rgb/', 1305031102.1753, ''], ['', 12.345678, '.png'])
+    >>> name_parts("PXL_20240501_235959500"), name_parts("2024-05-02_00-00-00")
+    (['PXL_', 1714607999.5, ''], ['', 1714608000.0, ''])
+    """
+    parts = _split(name)
+    parts[1::2] = (float(part) if "." in part else int(part) for part in parts[1::2])
+    return parts
+
+
+def _split(name: str) -> list[str]:
+    """Split a name into text, at even places, and digits; date and time of day are written as seconds."""
+    return re.split(_NUMBER, _SECONDS_NANOSECONDS.sub(r"\1.\2", _DATED.sub(_seconds, name)))
+
+
+def _seconds(found: re.Match) -> str:
+    """Write date and time of day as seconds since 1970; other digits stay as they are."""
+    year, _, month, day, hour, _, minute, second, thousandths = found.groups()
+    try:
+        date = datetime(*map(int, (year, month, day, hour, minute, second)), tzinfo=timezone.utc)
+    except ValueError:
+        return found[0]
+    return f"{int(date.timestamp())}.{thousandths or '000'}000"
+
+
+class NameNumbers(NamedTuple):
+    """What names say: ``frames``, a number each, in any unit; ``cameras``, None without a rig; ``told``, how
+    they were read.
+    """
+
+    frames: list[float]
+    cameras: list[str] | None
+    told: str
+
+    @property
+    def times(self) -> list[float]:
+        """The frames scaled to [0, 1]."""
+        first, last = min(self.frames), max(self.frames)
+        return [(frame - first) / ((last - first) or 1) for frame in self.frames]
+
+
+@dataclass(frozen=True)
+class _Reading:
+    """A way to read names: ``frames`` as numbers, of ``cameras`` (names that are equal in it are of one)."""
+
+    what: str
+    frames: list[float]
+    cameras: list[tuple]
+
+    @property
+    def groups(self) -> list[set[float]]:
+        """Frame numbers of each camera."""
+        found: dict[tuple, set[float]] = {}
+        for camera, frame in zip(self.cameras, self.frames):
+            found.setdefault(camera, set()).add(frame)
+        return list(found.values())
+
+    @property
+    def is_unique(self) -> bool:
+        """Whether no camera has a frame number twice."""
+        return sum(map(len, self.groups)) == len(self.frames)
+
+    def shared(self) -> float:
+        """Return the least share of all frame numbers that a camera has."""
+        return min(map(len, self.groups)) / len({*self.frames})
+
+
+def read_names(
+    names: Sequence[str],
+    where: str,
+    pattern: str | None = None,
+    centers: Sequence[Sequence[float]] | None = None,
+) -> NameNumbers | None:
+    """Read a frame number or a time from each name, if there is one way to read them.
+
+    Args:
+        names: paths of the images without suffix, ``cam01/0003``; of all splits together.
+        where: what the names are of, for errors.
+        pattern: regular expression with a group ``time`` or ``frame``, and ``camera`` for a rig, that is
+            found in every name; None: see the module's rules below.
+        centers: positions of the cameras (x, y, z), which tell cameras of a rig from parts of one film.
+
+    Returns:
+        the numbers; None where names have no number that varies, or have one twice and no other.
+
+    Raises:
+        SceneError: for a pattern that is none, lacks a group or misses a name; and without a pattern for
+            names of which one has another form, or that may be read in several ways, naming these.
+
+    Rules without a pattern: date and time of day, and ``seconds.fraction``, are one number. A number after
+    ``frame`` or ``time`` is the frame's, one after ``cam``, ``view`` or ``sensor`` the camera's. Of several
+    other numbers the last counts frames and the rest tell cameras if all cameras have nearly the same frame
+    numbers and their positions do not continue one path; all numbers together order one film if they do, or
+    if no frame number comes twice.
+
+    >>> read_names(["a/0001", "a/0003", "b/0001", "b/0003"], "t.json").frames
+    [1.0, 3.0, 1.0, 3.0]
+    """
+    if pattern is not None:
+        return _by_pattern(names, where, pattern)
+    rows = _of_one_form(names, where)
+    if rows is None:
+        return None
+    fractions = [i for i in range(3, len(rows[0]), 2) if _joined_fraction(rows, i)]
+    places = [i for i in range(1, len(rows[0]), 2) if len({float(row[i]) for row in rows}) > 1]
+    places = [i for i in places if i not in fractions]
+    if not places or all(_word(rows, i, _CAMERA_WORD) for i in places):
+        return None
+    found = _chosen(rows, places, where, centers)
+    if found is None:
+        return None
+    frames, told = _unrolled(rows, found)
+    refuse_far(dict(zip(names, frames)), where, "number", f"rename it, or {KEY}")
+    if len(found.groups) > 1:
+        _check_groups(found, names, where)
+        if len({*frames}) < len(frames):
+            told += "; images of one number share a time"
+    cameras = ["".join(camera) for camera in found.cameras] if len({*found.cameras}) > 1 else None
+    return NameNumbers(frames, cameras, told)
+
+
+def _by_pattern(names: Sequence[str], where: str, pattern: str) -> NameNumbers:
+    try:
+        compiled = re.compile(pattern)
+    except (re.error, TypeError) as error:
+        raise mismatch("data.name_pattern", "a regular expression", f"'{pattern}' ({error})") from None
+    groups = [name for name in ("time", "frame") if name in compiled.groupindex]
+    if len(groups) != 1:
+        got = " and ".join(groups) or "neither"
+        raise mismatch("data.name_pattern", "a group named time or frame, as (?P<frame>[0-9]+)", got)
+    found = [compiled.search(name) for name in names]
+    if None in found:
+        missed = names[found.index(None)]
+        raise mismatch("data.name_pattern", f"to be found in every name of {where}", f"not in '{missed}'")
+    try:
+        frames = [float(match[groups[0]]) for match in found]
+    except (TypeError, ValueError):
+        bad = next(match[groups[0]] for match in found if not re.fullmatch(r"[\d.]+", match[groups[0]] or ""))
+        raise mismatch(f"data.name_pattern: group {groups[0]}", "a number", f"'{bad}'") from None
+    cameras = [match["camera"] for match in found] if "camera" in compiled.groupindex else None
+    reading = _Reading("", frames, [(camera,) for camera in cameras or [""] * len(names)])
+    if not reading.is_unique:
+        seen: set = set()
+        pairs = list(zip(reading.cameras, frames))
+        twice = next(i for i, pair in enumerate(pairs) if pair in seen or seen.add(pair))
+        expected = f"each {groups[0]} once" if cameras is None else f"each {groups[0]} once a camera"
+        got = f"{frames[twice]:g} again in '{names[twice]}'"
+        advice = "name the camera by a group 'camera'" if cameras is None else ""
+        raise mismatch("data.name_pattern", expected, got, advice)
+    return NameNumbers(frames, cameras, "taken from the images' names by data.name_pattern")
+
+
+def _of_one_form(names: Sequence[str], where: str) -> list[list[str]] | None:
+    """Split all names into as many texts and numbers; None where they have no number in common.
+
+    Raises:
+        SceneError: naming one of a few names that differ from all others.
+    """
+    rows = [_split(name) for name in names]
+    counts = [len(row) for row in rows]
+    if len({*counts}) > 1:  # folders may be called differently
+        files = [_split(name.rpartition("/")[2]) for name in names]
+        folders = [name.rpartition("/")[0] for name in names]
+        rows = [[f"{folder}/{row[0]}", *row[1:]] for folder, row in zip(folders, files)]
+        counts = [len(row) for row in rows]
+    usual = max({*counts}, key=counts.count)
+    odd = [name for name, count in zip(names, counts) if count != usual]
+    if 0 < len(odd) <= _ODD * len(names):
+        like = names[counts.index(usual)]
+        more = f" and {len(odd) - 1} more" if len(odd) > 1 else ""
+        raise mismatch(where, f"names of one form, as '{like}'", f"'{odd[0]}'{more}", f"rename it, or {KEY}")
+    if odd:  # what differs is before the last number
+        if min(counts) < 3:
+            return None
+        rows = [["".join(row[:-2]), *row[-2:]] for row in rows]
+    return rows if len(rows[0]) > 1 else None
+
+
+def _word(rows: Sequence[Sequence[str]], place: int, word: re.Pattern) -> bool:
+    """Tell whether a word stands before a number in all names."""
+    return all(word.search(row[place - 1]) for row in rows)
+
+
+def _joined_fraction(rows: list[list[str]], place: int) -> bool:
+    """Join a fraction of a second to the seconds before it, and tell whether there was one.
+
+    Digits after a point are a fraction if all have one width and some reach half of a whole; a counter's are
+    small.
+    """
+    if any(row[place - 1] != "." or "." in row[place - 2] + row[place] for row in rows):
+        return False
+    widths = {len(row[place]) for row in rows}
+    if len(widths) > 1 or (width := widths.pop()) < 2 or _word(rows, place - 2, _CAMERA_WORD):
+        return False
+    if max(int(row[place]) for row in rows) < 0.5 * 10**width:
+        return False
+    for row in rows:
+        row[place - 2] = f"{row[place - 2]}.{row[place]}"
+    return True
+
+
+def _chosen(
+    rows: list[list[str]], places: list[int], where: str, centers: Sequence[Sequence[float]] | None
+) -> _Reading | None:
+    """Choose the one reading that survives.
+
+    Raises:
+        SceneError: naming the readings where two do.
+    """
+    texts = [i for i in range(0, len(rows[0]), 2) if len({row[i] for row in rows}) > 1]
+
+    def of_place(place: int, what: str) -> _Reading:
+        others = sorted([*texts, *(i for i in places if i != place)])
+        cameras = [tuple(row[i] for i in others) for row in rows]
+        return _Reading(what, [float(row[place]) for row in rows], cameras)
+
+    named = [i for i in places if _word(rows, i, _FRAME_WORD)]
+    for_cameras = [i for i in places if _word(rows, i, _CAMERA_WORD)]
+    free = [i for i in places if i not in for_cameras]
+    if named or len(free) == 1:
+        reading = of_place((named or free)[-1], "taken from the numbers in the images' names")
+        return reading if reading.is_unique else None
+    rig = of_place(free[-1], "the last number counts frames, the others tell cameras")
+    cameras = [tuple(row[i] for i in (*texts, *for_cameras)) for row in rows]
+    film = _Reading("all numbers together order one film", _ranked(rows, free), cameras)
+    path = None if centers is None else _path(rig, film, centers)
+    are_apart = sum(map(len, rig.groups)) == len({*rig.frames})
+    is_rig = rig.is_unique and rig.shared() >= _SAME_FRAMES and not are_apart
+    in_folder = len(free) == 2 and all("/" in "".join(row[free[0] + 1 : free[1]]) for row in rows)
+    if path is None and (are_apart or (is_rig and in_folder)):  # most rigs have a folder for each camera
+        path = "film" if are_apart else "rig"
+    if path == "rig" and is_rig:
+        return rig
+    if path == "film" and film.is_unique:
+        return film
+    readings = f"{rig.what} ({len({*rig.frames})} times), or {film.what} ({len({*film.frames})} times)"
+    expected, got = "names that tell times in one way", f"names as '{''.join(rows[0])}': {readings}"
+    raise mismatch(where, expected, got, f"write time in each frame, or {KEY}")
+
+
+def _ranked(rows: Sequence[Sequence[str]], places: Sequence[int]) -> list[float]:
+    """Number names by several numbers, the first of which weighs most.
+
+    Where the last number grows all the way, as of frames counted through all chapters, it is the frame's.
+    """
+    keys = [tuple(float(row[i]) for i in places) for row in rows]
+    ordered = sorted({*keys})
+    last = [key[-1] for key in ordered]
+    if all(a < b for a, b in zip(last, last[1:])):
+        return [key[-1] for key in keys]
+    ranks = {key: float(rank) for rank, key in enumerate(ordered)}
+    return [ranks[key] for key in keys]
+
+
+def _path(rig: _Reading, film: _Reading, centers: Sequence[Sequence[float]]) -> str | None:
+    """Tell a rig from one film by where the cameras are; None where that does not tell.
+
+    Ordered as one film, a camera that moves on makes steps of about one length also where what would be
+    cameras of a rig meet.
+    """
+    order = np.argsort(film.frames, kind="stable")
+    steps = np.linalg.norm(np.diff(np.asarray(centers, np.float64)[order], axis=0), axis=-1)
+    cameras = [rig.cameras[i] for i in order]
+    meets = [a != b for a, b in zip(cameras, cameras[1:])]
+    within = [step for step, meet in zip(steps, meets) if not meet]
+    across = [step for step, meet in zip(steps, meets) if meet]
+    extent = float(np.ptp(np.asarray(centers, np.float64), axis=0).max())
+    if not within or not across or median(within) > _STEP * extent or extent == 0:
+        return None
+    least = 1e-6 * extent
+    ratio = (median(across) + least) / (median(within) + least)
+    return "film" if ratio <= _ONE_PATH else "rig" if ratio >= _JUMPS else None
+
+
+def _unrolled(rows: Sequence[Sequence[str]], reading: _Reading) -> tuple[list[float], str]:
+    """Continue a counter that began anew after its last number, as 9999; also say what was read."""
+    frames, told = reading.frames, f"{reading.what}, {min(reading.frames):.10g} to {max(reading.frames):.10g}"
+    highest, lowest = max(frames), min(frames)
+    turn = 10 ** len(f"{highest:.0f}")
+    numbers = sorted({*frames})
+    gap, after = max(((b - a, b) for a, b in zip(numbers, numbers[1:])), default=(0, 0))
+    ends = sum(number >= 0.99 * turn for number in numbers), sum(number <= 0.01 * turn for number in numbers)
+    rolls = turn >= 10**_COUNTER_DIGITS and min(ends) > 1
+    if not rolls or gap < 0.5 * turn or highest % 1 or lowest % 1:
+        return frames, told
+    frames = [frame if frame >= after else frame + turn for frame in frames]
+    told = f"{reading.what}: {after:g} to {highest:g}, then {lowest:g} on, taken as a counter that began anew"
+    return frames, told
+
+
+def refuse_far(named: Mapping[str, float], where: str, what: str, advice: str) -> None:
+    """Refuse a few times or numbers far from all others, which would squeeze these to one moment.
+
+    Raises:
+        SceneError: naming the farthest, ``what`` of it is meant, and the ``advice``.
+    """
+    times = sorted({*named.values()})
+    middle = times[len(times) // 2]
+    *rest, far = sorted(times, key=lambda time: abs(time - middle))
+    rest = rest[: len(times) - max(1, int(_MOST_FAR * len(times)))]
+    if len(rest) > 2 and max(rest) - min(rest) < LEAST_SPAN * (times[-1] - times[0]):
+        name = next(name for name, time in named.items() if time == far)
+        expected = f"a {what} near all others, {min(rest):.10g} to {max(rest):.10g}"
+        raise mismatch(f"{where}: {what} of {name}", expected, f"{far:.10g}", advice)
+
+
+def _check_groups(reading: _Reading, names: Sequence[str], where: str) -> None:
+    """Refuse cameras or splits that share some numbers and were counted apart, as 0 to 149 and 0 to 19."""
+    everything = sorted({*reading.frames})
+    whole, groups = everything[-1] - everything[0], reading.groups
+    counted = [sum(number in group for group in groups) for number in everything]
+    if max(counted) == 1:  # no number twice: one numbering of all
+        return
+    for group, camera in zip(groups, dict.fromkeys(reading.cameras)):
+        if len(group) > 1 and max(group) - min(group) < _SPAN * whole:
+            name = names[reading.cameras.index(camera)]
+            expected = f"one numbering of all images, {everything[0]:g} to {everything[-1]:g}"
+            got = f"{min(group):g} to {max(group):g} for '{name}' and its like"
+            raise mismatch(where, expected, got, f"write time in each frame, or {KEY}")

@@ -1,0 +1,96 @@
+"""Names of images, as cameras, phones, rigs and programs write them."""
+
+import numpy as np
+import pytest
+
+from forewarp.data.names import read_names
+from tests.support.written_scenes import refused
+
+RIG = [(3.0 * k, 0, 0) for k in range(3) for _ in range(4)]  # three cameras that stand
+PATH = [(0.1 * i, 0, 0) for i in range(12)]  # one camera that moves on
+
+
+def in_groups(form: str, firsts, lasts) -> list[str]:
+    return [form.format(a, b) for a in firsts for b in lasts]
+
+
+@pytest.mark.parametrize(
+    ("names", "frames"),
+    [
+        ([f"images/{i:04d}" for i in (1, 2, 5)], [0, 1, 4]),
+        ([f"2024-05-01_10-{m:02d}-{s:02d}" for m, s in ((5, 59), (6, 1), (6, 2))], [0, 2, 3]),
+        (["Screenshot 2024-05-01 23.59.59", "Screenshot 2024-05-02 00.00.01"], [0, 2]),
+        (["20231115_170425", "20231115_170430"], [0, 5]),
+        ([f"41048190_{s}" for s in ("3415.043", "3415.918", "3416.418")], [0, 0.875, 1.375]),
+        (["1700000000_500000000", "1700000001_000000000"], [0, 0.5]),
+        (["DSC_9998", "DSC_9999", "DSC_0001", "DSC_0003"], [0, 1, 3, 5]),  # a counter that began anew
+        ([f"clip{c}_{f:04d}" for c, f in ((1, 7), (1, 8), (2, 9), (2, 12))], [0, 1, 2, 5]),  # counted through
+        (in_groups("cam{}/DSC_{:04d}", range(6), range(1, 5)), [0, 1, 2, 3] * 6),
+        (in_groups("cam{}_frame{:02d}", range(2), range(3)), [0, 1, 2] * 2),
+        (in_groups("frame_{1:05d}_{0}", range(2), (1, 3)), [0, 2] * 2),
+        (in_groups("{}/{:03d}", range(3), range(4)), [0, 1, 2, 3] * 3),  # a folder for each camera
+        ([f"IMG_{i:04d}_2024010112000{i}" for i in range(3)], [0, 1, 2]),
+        (["train/0001", "train/0005", "test/0003"], [0, 4, 2]),
+    ],
+)  # fmt: skip
+def test_numbers_that_names_say_in_one_way(names, frames):
+    found = np.array(read_names(names, "t.json").frames)
+    assert found - found.min() == pytest.approx(frames, abs=1e-5)
+
+
+@pytest.mark.parametrize("form", ["{}_{:03d}", "s{}/{:03d}", "cam_{}_{:03d}", "{}-{:03d}"])
+def test_where_cameras_are_tells_a_rig(form):
+    found = read_names(in_groups(form, range(3), range(4)), "t.json", centers=RIG)
+    assert found.frames == [0, 1, 2, 3] * 3
+    assert len({*found.cameras}) == 3
+
+
+@pytest.mark.parametrize("form", ["{}_{:03d}", "part{}/{:03d}", "1_{}_{:03d}"])
+def test_where_cameras_are_tells_one_film(form):
+    found = read_names(in_groups(form, range(3), range(4)), "t.json", centers=PATH)
+    assert found.frames == list(range(12))
+    assert found.cameras is None
+
+
+@pytest.mark.parametrize(
+    ("names", "said"),
+    [
+        (in_groups("{}_{:03d}", range(3), range(4)), r"names as '0_000': .* \(4 times\), or .* \(12 times\)"),
+        ([f"IMG_20231115_1704{i:02d}" for i in range(9)] + ["IMG_20231115_170403 (1)"], r"'IMG_.*1\)'; ren"),
+        ([f"r_{i:03d}" for i in range(30)] + ["r_90000"], "number of r_90000: expected .* 1 to 28"),
+        (in_groups("train/{1:03d}{0}", [""], range(150)) + in_groups("test/{1:03d}{0}", [""], range(20)),
+         "one numbering of all images, 0 to 149, but got 0 to 19 for 'test/000'"),
+        ([f"{c}_{i}" for c, n in ((1, 9), (2, 5)) for i in range(n)], "names that tell times in one way"),
+    ],
+)  # fmt: skip
+def test_names_of_several_readings_are_refused(names, said):
+    with refused(said + ".*data.name_pattern"):
+        read_names(names, "t.json")
+
+
+def test_names_that_say_nothing():
+    assert read_names(["left", "right"], "t.json") is None
+    assert read_names(["a/1", "a/01", "b/7"], "t.json") is None  # one number twice
+    assert read_names([f"cam{i}" for i in range(4)], "t.json") is None
+
+
+def test_a_pattern_settles_every_case():
+    names = in_groups("{}_{:03d}", range(2), (4, 6))
+    found = read_names(names, "t.json", r"(?P<camera>\d)_(?P<frame>\d+)")
+    assert (found.frames, found.cameras) == ([4, 6, 4, 6], ["0", "0", "1", "1"])
+    assert read_names(["a1.5", "a2"], "t.json", r"a(?P<time>[\d.]+)").frames == [1.5, 2]
+
+
+@pytest.mark.parametrize(
+    ("pattern", "said"),
+    [
+        ("(", r"data.name_pattern: expected a regular expression, but got '\('"),
+        ("[0-9]+", "a group named time or frame, .* but got neither"),
+        (r"x(?P<frame>\d+)", "to be found in every name of t.json, but got not in '0_004'"),
+        (r"_(?P<frame>\d+)", "each frame once, but got 4 again in '1_004'; name the camera by a group"),
+        (r"(?P<frame>_)", "group frame: expected a number, but got '_'"),
+    ],
+)
+def test_a_pattern_that_cannot_be_used_is_refused(pattern, said):
+    with refused(said):
+        read_names(in_groups("{}_{:03d}", range(2), (4, 6)), "t.json", pattern)
