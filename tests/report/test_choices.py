@@ -98,9 +98,11 @@ def test_changes_are_against_the_same_seed(tmp_path):
     write_run(runs, "grid_64", 2, psnr=28.25, steps=200, epe=0.1)
     write_run(runs, "unet_16", 0, psnr=30.5, steps=50, against="grid_64")
     # Named by what was typed; what all of them share is no part of their names.
-    write_run(runs, "data.box=null", 4, psnr=20.0, against=None)
-    write_run(runs, "data.box=null preset.rays=64", 4, psnr=21.0, against=None)
-    write_run(runs, "data.box=null model=backward preset.rays=64", 4, psnr=21.5, against=None)
+    of_cube = {"scene": "cube", "against": None}
+    write_run(runs, "data.box=auto", 4, psnr=20.0, **of_cube)
+    write_run(runs, "data.box=auto preset.rays=64", 4, psnr=21.0, **of_cube)
+    backward = {"model": {"name": "backward"}}
+    write_run(runs, "data.box=auto model=backward preset.rays=64", 4, psnr=21.5, config=backward, **of_cube)
     write_run(runs, "alone", 5)
     write_run(runs, "failed", psnr=None)
     page, file = write_price_list(runs, tmp_path / "out")
@@ -113,9 +115,9 @@ def test_changes_are_against_the_same_seed(tmp_path):
     assert "3 differences are of three seeds or more; by chance 0.15 of their intervals" in text
     assert change[5:] == ["-0.1000 ± 0.0000", "×0.50 ± 0.00", *["×1.00 ± 0.00"] * 3, "×2.00 ± 0.00"]
     assert rows_of(text, "unet_16")[0][1:6] == ["grid_64", "1", "+1.50", "+0.0000", ""]
-    assert rows_of(text, "preset.rays=64")[1][1:4] == ["base", "1", "+1.00"]
-    assert rows_of(text, "model=backward preset.rays=64")[0][1:4] == ["preset.rays=64", "1", "+0.50"]
-    assert len(rows_of(text, "base")) == 1
+    assert rows_of(text, "rays=64")[1][1:4] == ["base", "1", "+1.00"]
+    assert rows_of(text, "backward-fast rays=64")[0][1:4] == ["rays=64", "1", "+0.50"]
+    assert len(rows_of(text, "base")) == 2  # of each scene
     assert rows_of(text, "alone")[0][2:4] == ["0", ""]  # nothing to compare it with
     assert "Of all test views:" in text
     assert "* ball/failed-1.0-seed0: no metrics.json" in text

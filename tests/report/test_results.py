@@ -30,16 +30,16 @@ def test_a_run_is_read_whole(tmp_path):
     known = {"variant": "forward-fast", "ablation": None, "about": "", "ability": "time", "epe": None}
     assert row["points"] == ()
     assert {name: row[name] for name in known} == known
-    assert against(row, Runs([row])) == "base"
+    assert against(row, Runs([row])) == "forward-fast"  # itself
     assert row["command"] == f"forewarp-train # as {folder}/config.yaml"
 
 
 def test_names_do_not_depend_on_spaces_within_an_override(tmp_path):
     plain, spaced = "size=[[0,8000]]", "size=[[0, 8000]]"
-    for name in ("", spaced, f"rays=64 {plain}", f"data.box=null {spaced}"):
+    for name in ("", spaced, f"rays=64 {plain}", f"data.box=auto {spaced}"):
         write_run(tmp_path, name, against=None)
     runs, _ = read_runs(tmp_path)
-    assert sorted(runs.by("variant")) == ["base", f"data.box=null {plain}", f"rays=64 {plain}", plain]
+    assert sorted(runs.by("variant")) == ["base", f"box=auto {plain}", f"rays=64 {plain}", plain]
     assert {against(row, runs) for row in runs} == {"base", plain}
 
 

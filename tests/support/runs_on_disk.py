@@ -1,10 +1,13 @@
 """Writes what a finished run leaves, without training anything."""
 
 import json
+import shlex
 from pathlib import Path
 
 import imageio.v3 as iio
 import yaml
+
+from forewarp.report.settings import words_of
 
 
 def write_run(
@@ -26,14 +29,17 @@ def write_run(
 ):
     """A run's folder; None for ``psnr`` or ``curve`` leaves out what would hold it.
 
-    ``config`` and ``metrics`` are merged into what is written.
+    ``config`` and ``metrics`` are merged into what is written. None for ``against``: ``variant`` is no name,
+    but what was typed.
     """
     folder = Path(root) / scene / f"{variant}-{minutes}-seed{seed}"
     (folder / "coarse").mkdir(parents=True)
-    variant_of = {"name": variant} | ({"about": f"the {variant}", "against": against} if against else {})
+    variant_of = {"name": variant, "about": f"the {variant}", "against": against} if against else None
     whole = {"data": {"scene": scene}, "model": {"name": "forward"}, "preset": {"name": "fast"}}
     whole |= {"budget": {"minutes": minutes}, "variant": variant_of, "seed": seed}
-    whole["command"] = command or f"forewarp-train variant={variant} seed={seed}"
+    words = [f"variant={variant}"] if against else words_of(variant)
+    whole |= {"typed": {word.partition("=")[0]: word.partition("=")[2] for word in words if not against}}
+    whole["command"] = command or shlex.join(["forewarp-train", *words, f"seed={seed}"])
     (folder / "config.yaml").write_text(yaml.safe_dump(whole | (config or {})))
     (folder / "coarse" / "done.json").write_text(json.dumps({"steps": steps, "seconds": 50.0}))
     if psnr is not None:

@@ -6,7 +6,7 @@ Functions that write search a folder for measured runs, write to ``out``, and re
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import chain
@@ -19,14 +19,16 @@ import yaml
 from forewarp.files import MOST_CONFIG, read_rows, read_text, replace_file
 from forewarp.metrics.registry import metric_of
 from forewarp.report import figures
-from forewarp.report.results import CONDITIONS, Runs, add_rows, grouped, in_words, key_of, length, read_runs
+from forewarp.report.results import Row, Runs, add_rows, in_words, length, nothing, read_runs
+from forewarp.report.settings import CONDITIONS, grouped, key_of
 from forewarp.report.statistics import LEAST, by_chance, paired_change, rank, verdict
 from forewarp.report.tables import Column, Table, rendered, score_columns
 
 OTHERS = Path(__file__).with_name("published.yaml")  # results of others
 LENGTHS = 3  # of training, at least: two points make no curve
-TASK = ("scene", "preset", "minutes", *CONDITIONS)
+TASK = ("scene", "preset", "minutes", "setting", *CONDITIONS)
 BEGIN = {"label": "scene", "took": Column("minutes", 0)}
+DENSITY = r"stage\.\w+\.density"  # of particles; the last stage's tells
 COSTS = {"processor": Column("processor (s)", 0), "wall": Column("wall (s)", 0), "steps": Column("steps", 0)}
 COSTS |= {"ms": Column("ms a step", 1), "frame": Column("seconds per image", 3)}
 COSTS |= {"parameters": Column("parameters (M)"), "memory": Column("GiB")}
@@ -70,11 +72,13 @@ def write_minutes(folder: Path, out: Path, published: Path | None = None) -> lis
     """
     others = read_published(published)
     runs, left_out = _timed(folder)
+    if not runs:
+        raise _nothing(folder, runs, left_out)
     methods, written = {row["method"] for row in runs}, []
     for file in out.glob("*.csv"):  # of earlier calls
         named = {row.get("method") for row in read_rows(file)}
         methods |= named if named == {file.stem} and file.with_suffix(".md").is_file() else set()
-    rows = {name: add_rows(out / f"{name}.csv", runs.where(method=name)) for name in sorted(methods)}
+    rows = {name: added(out / f"{name}.csv", runs.where(method=name)) for name in sorted(methods)}
     tables = {method: labelled(own) for method, own in rows.items()}
     for method, own in tables.items():
         rivals = {other: found for other, found in tables.items() if other != method}
@@ -91,25 +95,41 @@ def write_minutes(folder: Path, out: Path, published: Path | None = None) -> lis
 
 
 def _timed(folder: Path) -> tuple[Runs, list[str]]:
-    """Read the measured runs of so many minutes, the newest of equal ones; and a line for each other run."""
+    """Read the measured runs of so many minutes, and a line for each other run."""
     runs, left_out = read_runs(folder)
-    endless = [(row, "no budget.minutes") for row in runs.where(minutes=None)]
-    runs, older = Runs(row for row in runs if row["minutes"] is not None).newest("method", "seed", *TASK)
-    unused = [*endless, *((row, "another run of the same is newer") for row in older)]
-    return runs, left_out + [f"{row['folder'].relative_to(folder)}: {why}" for row, why in unused]
+    endless = [f"{row['folder'].relative_to(folder)}: no budget.minutes" for row in runs.where(minutes=None)]
+    return Runs(row for row in runs if row["minutes"] is not None), left_out + endless
+
+
+def _nothing(folder: Path, runs: Runs, left_out: Sequence[str]) -> ValueError:
+    takes = "runs of budget.minutes with a config.yaml and metrics.json"
+    return nothing(folder, runs, left_out, takes, "make some with forewarp-train --multirun sweeps=minutes")
 
 
 def labelled(runs: Runs) -> Runs:
-    """Give rows a ``label``: the scene and, where its plain rows differ in preset or ``CONDITIONS``, in what;
+    """Give rows a ``label``: the scene and, where its plain rows differ in what ``TASK`` has more, in what;
     and likewise a ``group``: the dataset, of whose scenes there is a mean.
     """
-    found = Runs()
+    found, names = Runs(), ("preset", "changed", *CONDITIONS)
     for row in runs:
         others, is_plain = plain(runs.where(scene=row["scene"])), bool(plain(Runs([row])))
-        words = in_words(row, others, ("preset", *CONDITIONS)) if is_plain else []
+        words = in_words(row, others, names) if is_plain else []
         label, group = (", ".join([name, *words]) for name in (row["scene"], row["dataset"] or ""))
         found.append(row | {"label": label, "group": group})
     return found
+
+
+def added(file: Path, rows: Iterable[Row]) -> Runs:
+    """Add rows as ``add_rows`` does; give all their ``density`` and, where settings differ in more, what else
+    was ``changed``.
+    """
+    runs = add_rows(file, rows)
+    for row in runs:
+        of_density = {key: word for key, word in row["words"].items() if re.fullmatch(DENSITY, key)}
+        others = [word for key, word in row["words"].items() if key not in of_density]
+        numbers = [float(word.rpartition("=")[2]) for word in of_density.values()]
+        row |= {"density": numbers[-1] if numbers else None, "changed": " ".join(others) or None}
+    return runs
 
 
 def plain(runs: Runs) -> Runs:
@@ -197,7 +217,8 @@ def _by_minutes(runs: Runs) -> Table:
 
 def _against_fewer(runs: Runs, varied: str, order: Callable[[Runs], float]) -> list[dict]:
     """List groups that differ in one thing alone, each with how its PSNR changes from the group before."""
-    shared, lines = [name for name in TASK if name != varied], []
+    own = ("setting" if varied == "density" else varied,)  # a setting has the density, and what was changed
+    shared, lines = [name for name in (*TASK, "changed") if name not in own], []
     series = grouped((key_of(group[0], shared), group) for group in alike(runs))
     for groups in (sorted(found, key=order) for found in series.values() if len(found) > 1):
         for before, group in zip([None, *groups], groups):
@@ -229,6 +250,9 @@ def _beside(method: str, runs: Runs, other: str, rivals: Runs) -> Table:
             rows = group[0], rival[0]
             # What a table of an earlier version lacks is no bar.
             lacking = [n for n in ("device", "measured", "pictures") if None in (rows[0][n], rows[1][n])]
+            lacking += ["setting"]  # each has its own; the other method is as its preset
+            if rival[0]["changed"]:
+                continue
             if len({key_of(row, (name for name in TASK if name not in lacking)) for row in rows}) == 1:
                 line = row_of(group)
                 seeds, psnr = f"{len(group)} and {len(rival)}", (g.estimate("psnr") for g in (group, rival))
@@ -266,9 +290,10 @@ def _write_lengths(tables: Mapping[str, Runs], out: Path, published: Sequence[Pu
     under the same ``CONDITIONS``; results of others are drawn beside scenes of their dataset.
     """
     runs = Runs(row | {"label": row["scene"]} for found in tables.values() for row in plain(found))
-    colors, compared = {method: f"C{number}" for number, method in enumerate(sorted(tables))}, {}
+    runs = Runs(row | {"name": " ".join(filter(None, (row["method"], row["changed"])))} for row in runs)
+    colors, compared = {name: f"C{number}" for number, name in enumerate(runs.by("name"))}, {}
     for of_task in runs.by("scene", "preset", *CONDITIONS).values():
-        lengths = {method: alike(found) for method, found in of_task.by("method").items()}
+        lengths = {name: alike(found) for name, found in of_task.by("name").items()}
         lengths = {method: groups for method, groups in lengths.items() if len(groups) >= LENGTHS}
         if len(lengths) > 1:  # the title says in what the scene's rows differ
             words = in_words(of_task[0], runs.where(scene=of_task[0]["scene"]), ("preset", *CONDITIONS))
@@ -324,11 +349,14 @@ def write_methods(folder: Path, out: Path) -> list[Path]:
     ablations = [row for row in found if row["ablation"] not in (None, "base")]
     left_out += [f"{row['folder'].relative_to(folder)}: an ablation" for row in ablations]
     page, table = out / "methods.md", out / "methods.csv"
+    if not found and not table.is_file():
+        raise _nothing(folder, found, left_out)
     runs = add_rows(table, (row for row in found if row not in ablations))
     earlier, scenes, written = read_text(page) if page.is_file() else "", [], [page, table]
     for scene, own in runs.by("scene").items():
         several = len(own.by("preset")) > 1
-        own = Runs(row | {"name": row["method"] + f" ({row['preset']})" * several} for row in own)
+        named = ((row, " ".join([row["method"], *row["words"].values()])) for row in own)
+        own = Runs(row | {"name": name + f" ({row['preset']})" * several} for row, name in named)
         pictures, drawn = _pictures(scene, own, out, earlier)
         tables = [_reached(group, own) for group in own.by("minutes", *CONDITIONS).values()]
         scenes.append({"name": scene, "pictures": pictures, "tables": tables})

@@ -18,7 +18,8 @@ from forewarp.files import read_json, replace_file
 from forewarp.metrics.registry import METRICS, metric_of
 from forewarp.report.benchmark import read_published
 from forewarp.report.figures import draw_scene
-from forewarp.report.results import KINDS, PLACES, Point, Row, Runs, overrides, read_runs
+from forewarp.report.results import KINDS, PLACES, Point, Row, Runs, in_words, nothing, read_runs
+from forewarp.report.settings import CONDITIONS, family_of, words_of
 from forewarp.report.statistics import FACTORS, Estimate, by_chance, paired_change, verdict
 from forewarp.report.tables import Column, Difference, Table, rendered, score_columns
 
@@ -45,13 +46,23 @@ def by_variant(runs: Runs, *names: str) -> dict:
 
 
 def _read(folder: Path, needed: Sequence[str] = ("metrics.json",)) -> tuple[Runs, list[str]]:
-    """Read runs as ``read_runs`` does; a scene with some of its training views is another scene, unless their
-    number is the choice that is compared.
+    """Read runs as ``read_runs`` does; those that differ in conditions are variants of their own, and a scene
+    with some of its training views is another scene, unless their number is the choice that is compared.
+
+    Raises:
+        ValueError: if there is none.
     """
     runs, left_out = read_runs(folder, needed)
+    if not runs:
+        takes = f"runs with a config.yaml and {' and '.join(needed)}"
+        raise nothing(folder, runs, left_out, takes, "make some with forewarp-train --multirun")
     for row in runs:
         if row["train_views"] and "train_views" not in row["variant"]:
             row["scene"] += f" ({row['train_views']} training views)"
+    names = [name for name in CONDITIONS if name != "train_views"]
+    for same in runs.by("scene", "variant", "minutes").values():
+        for row, words in [(row, in_words(row, same, names)) for row in same]:
+            row["variant"] = ", ".join([row["variant"], *words])
     return runs, left_out
 
 
@@ -145,10 +156,16 @@ def measures_of(runs: Runs) -> dict[str, Column]:
 
 
 def against(row: Row, runs: Runs) -> str:
-    """Choose the variant to compare a run with: the one it names, else the one with most of its overrides."""
-    own = set(overrides(row["variant"]))
-    inside = [name for name in runs.by("variant") if set(overrides(name)) < own]
-    return row["against"] or max(inside, key=lambda name: len(overrides(name)), default="base")
+    """Choose the variant to compare a run with: the one it names; else of its own method or the first's the
+    one with the most of its words; else the first: the base, or where there is none what was measured first.
+    """
+    first = min(runs, key=lambda other: (other["variant"] != "base", other["measured_at"]))
+    own, found = set(row["words"].items()), {}
+    for other in runs:
+        words, is_first = set(other["words"].items()), family_of(other) == family_of(first)
+        if words < own if family_of(other) == family_of(row) else is_first and words <= own:
+            found[other["variant"]] = len(words), is_first
+    return row["against"] or max(found, key=found.get, default=first["variant"])
 
 
 def references(runs: Runs) -> Table:
@@ -187,24 +204,39 @@ def write_effects(folder: Path, out: Path) -> list[Path]:
     any other method.
     """
     runs, left_out = _read(folder)
-    runs, files = runs.where(ablation=tuple(CHOICES)), []
+    chosen, files = runs.where(ablation=tuple(CHOICES)), []
+    if not chosen:
+        takes = f"runs of ablation={' or '.join(CHOICES)} with a metrics.json"
+        raise nothing(folder, runs, left_out, takes, "make some with make effects")
+    runs = _labelled(chosen)
     columns = {"scene": "scene", "ablation": "choice", "seed": "seed", "minutes": "minutes", "psnr": "PSNR"}
     columns |= {"steps": "steps", "planning": "planning, s", "command": "command"}
-    for model, own in (runs.by("method") or {"forward": runs}).items():
+    for model, own in runs.by("method").items():
         page = out / ("effects.md" if model == "forward" else f"effects-{model}.md")
-        newest, _ = own.newest("scene", "ablation", "seed")
-        planned = chain(*newest.where(ablation="auto").by("scene", "seed").values())
+        planned = chain(*own.where(ablation="auto").by("scene", "seed").values())
         first = {row["scene"]: row["plan"].get("effects", {}) for row in reversed([*planned])}
         about = {"model": model, "machine": own.machines(), "left_out": left_out}
         decisions = [(scene, *decided) for scene in sorted(first) for decided in first[scene].items()]
         why = [[scene, name.replace("_", " "), d["choice"], d["because"]] for scene, name, d in decisions]
         reasons = Table(["scene", "effect", "choice", "because"], why)
-        replace_file(page, rendered("effects.md.j2", **about, table=choices(newest), reasons=reasons))
+        replace_file(page, rendered("effects.md.j2", **about, table=choices(own), reasons=reasons))
         rows = chain(*own.by("scene", "ablation", "seed").values())
         lines = [row | {"planning": row["plan"].get("seconds")} for row in rows]
         replace_file(page.with_suffix(".csv"), Table.of(lines, columns).csv())
         files += [page, page.with_suffix(".csv")]
     return files
+
+
+def _labelled(runs: Runs) -> Runs:
+    """Add to the scene of each row in what the rows of its method there differ beside choice, seed and
+    minutes.
+    """
+    found = Runs()
+    for row in runs:
+        others = runs.where(method=row["method"], scene=row["scene"])
+        words = [*row["words"].values(), *in_words(row, others, ("preset", *CONDITIONS))]
+        found.append(row | {"scene": ", ".join([row["scene"], *words])})
+    return found
 
 
 def choices(runs: Runs) -> Table:
@@ -215,7 +247,7 @@ def choices(runs: Runs) -> Table:
     columns = ["scene", Column("seeds", 0), Column("minutes", None), *(CHOICES[name] for name in present)]
     columns += [Column("planned - best", signed=True), "", Column("planning, s", 1)]
     lines, changes = [], []
-    for scene, found in runs.by("scene").items():
+    for (scene, minutes), found in runs.by("scene", "minutes").items():
         by_choice = {name: found.where(ablation=name) for name in present}
         planned = by_choice.get("auto", Runs())
         means = {name: own.mean("psnr") for name, own in by_choice.items() if own and name != "auto"}
@@ -225,7 +257,6 @@ def choices(runs: Runs) -> Table:
             change = paired_change(planned.paired(by_choice[best]), "psnr")
             words = f"{verdict(change, below='**below**')}, {CHOICES[best]}"
             changes.append(change)
-        minutes = " or ".join(f"{minutes:g}" for minutes in found.by("minutes") if minutes)
         planning = Estimate.of(row["plan"]["seconds"] for row in planned if row["plan"])
         psnr, seeds = [own.estimate("psnr") for own in by_choice.values()], max(map(len, by_choice.values()))
         lines.append([scene, seeds, minutes, *psnr, change, words, planning])
@@ -235,8 +266,12 @@ def choices(runs: Runs) -> Table:
 def write_search(folder: Path, out: Path) -> list[Path]:
     """Write ``search.md``, and a CSV file a scene: the trials of ``sweeps=search``, the best first."""
     runs, left_out = read_runs(folder, ["score.json"])
+    scored = Runs(chain(*map(_scored, runs)))
+    if not scored:
+        takes, make = "runs with a score.json of the metric that their config.yaml names", "make some with"
+        raise nothing(folder, runs, left_out, takes, f"{make} forewarp-train --multirun sweeps=search")
     searches, written = [], []
-    for (scene, method, metric), found in Runs(chain(*map(_scored, runs))).by(*SEARCHED).items():
+    for (scene, method, metric), found in scored.by(*SEARCHED).items():
         known = metric_of(metric)
         best_first = sorted(found, key=lambda row: row["score"], reverse=known.higher_is_better)
         table = _trials(best_first, Column(known.heading, known.digits))
@@ -264,7 +299,7 @@ def _scored(row: Row) -> list[Row]:
 
 def _trials(trials: Sequence[Row], score: Column) -> Table:
     """List trials by the overrides in which they differ."""
-    typed = [dict(word.partition("=")[::2] for word in overrides(row["command"])) for row in trials]
+    typed = [dict(word.partition("=")[::2] for word in words_of(row["command"])) for row in trials]
     keys = dict.fromkeys(key for words in typed for key in words if key != "forewarp-train")
     chosen = [key for key in keys if len({words.get(key) for words in typed}) > 1]
     cells = [[_value(words.get(key)) for key in chosen] for words in typed]
@@ -279,7 +314,7 @@ def _again(row: Row) -> dict:
     stand for folders.
     """
     command = row["command"]
-    typed = {word.partition("=")[0] for word in overrides(command)}
+    typed = {word.partition("=")[0] for word in words_of(command)}
     if "#" not in command and "experiment" not in typed:  # a sweep's file may have chosen these
         chosen = {"model": row["method"], "preset": row["preset"]}
         command += "".join(f" {key}={name}" for key, name in chosen.items() if key not in typed)

@@ -295,8 +295,8 @@ def draw_resolution(path: Path, rows: Sequence[Row]) -> Path | None:
     for row in (row for row in rows if row["psnr"] is not None):
         voxels = row["config"]["stage"]["fine"]["num_voxels"][-1][1]
         runs.append(row | {"side": round(voxels ** (1 / 3))})
-    for key, group in runs.by("scene", "method", "preset", "minutes", "iterations").items():
-        *names, minutes, iterations = key
+    for key, group in runs.by("scene", "method", "preset", "setting", "minutes", "iterations").items():
+        *names, minutes, iterations = filter(lambda part: part != "", key)
         label = ", ".join([*names, f"{minutes or iterations:g}"])
         lines |= {label: group.by("side")} if len(group.by("side")) > 1 else {}
     if not lines:

@@ -21,14 +21,16 @@ from forewarp.files import MOST_CONFIG, read_text, replace_file
 from forewarp.metrics.registry import metric_of
 from forewarp.report import figures
 from forewarp.report.choices import every_run
-from forewarp.report.results import KINDS, Point, Row, Runs, grouped, read_runs
+from forewarp.report.results import KINDS, Point, Row, Runs, nothing, read_runs
+from forewarp.report.settings import grouped
 from forewarp.report.statistics import INTERVALS, LEAST, Estimate, by_chance, rank, verdict
 from forewarp.report.tables import Cell, Column, Difference, Section, Table, rendered
 
 PAPER = Path(__file__).with_name("paper.yaml")  # the printed numbers
 # What the runs of one row of a table have in common.
 BUDGET = "preset", "minutes", "iterations", "held_out", "train_views", "device", "threads", "clock", "tested"
-ROW = ("ablation", "method", *BUDGET)
+BUDGET += ("image_format",)
+ROW = ("ablation", "method", "setting", *BUDGET)
 UNPRINTED = ("particles", "backward")  # methods of this project that the paper prints no row of
 METHODS = ("particles", "forward", "backward")  # that are compared in pictures
 DATASETS = ("dnerf", "hypernerf", "nhr", "lego_complete")
@@ -155,16 +157,14 @@ def measured(table: PaperTable, runs: Runs, variants: Sequence[str] = ()) -> lis
 def by_seed(runs: Runs, group: Group, metric: str) -> dict[int, float]:
     """Average a metric over the scenes of a group, for each seed that all scenes have.
 
-    Empty if there is no such seed, or the scenes' images differ in size or background.
+    Empty if there is no such seed.
     """
-    scores, conditions = {}, set()
+    scores = {}
     for run in runs.where(origin=group.dataset, scene=group.scenes):
         of_run = run["test"].get(group.ability or run["ability"], {})
         if metric in of_run:
             scores[run["scene"], run["seed"]] = of_run[metric] * (100 if metric in DEPTH else 1)
-            protocol = run["metrics"].get("protocol", {})
-            conditions.add(tuple(protocol.get(key) for key in ("half_resolution", "scale", "background")))
-    seeds = sorted({seed for _, seed in scores}) if len(conditions) == 1 else []
+    seeds = sorted({seed for _, seed in scores})
     whole = [seed for seed in seeds if all((scene, seed) in scores for scene in group.scenes)]
     return {seed: fmean(scores[scene, seed] for scene in group.scenes) for seed in whole}
 
@@ -286,6 +286,9 @@ def name_of(runs: Runs, among: Sequence[Runs]) -> str:
     run = runs[0]
     about = run["method"] if run["ablation"] is None else run["about"] or run["ablation"]
     name, own = f"forewarp: {about}" + " (the paper's method)" * (about == "forward"), _conditions(runs)
+    name = " ".join([name, *run["words"].values()])
+    if len({other[0]["image_format"] for other in among}) > 1:
+        own.append(run["image_format"])
     alike = len(among) > 1 and all(_conditions(other) == own for other in among)
     return name if alike else ", ".join([name, *own])
 
@@ -343,6 +346,10 @@ def write_paper(
     """
     paper = read_paper(published or PAPER).values()
     runs, left_out = _read(folder, paper)
+    if not runs:
+        raise nothing(
+            folder, runs, left_out, "runs with a metrics.json", "make some with make reproduce-tables"
+        )
     for dataset, found in runs.by("origin").items():
         if dataset not in {group.dataset for table in paper for group in table.groups}:
             count = f"{dataset or 'no dataset'}, {len(found)} run{'s' * (len(found) > 1)}"
@@ -377,7 +384,7 @@ def write_paper(
 
 
 def _read(folder: Path, tables: Iterable[PaperTable]) -> tuple[Runs, list[str]]:
-    """Read the measured runs, of runs with the same table entry the newest; and a line for each other run.
+    """Read the measured runs, and a line for each other run.
 
     A protocol names the kind of test view that is shown where columns of ``tables`` name none.
     """
@@ -386,8 +393,7 @@ def _read(folder: Path, tables: Iterable[PaperTable]) -> tuple[Runs, list[str]]:
     for run in runs:
         if run["origin"] in open_kind and run["ability"] != "all":
             run["protocol"] += f", scores of test views {KINDS.get(run['ability'], run['ability'])}"
-    runs, older = runs.newest("dataset", "scene", "seed", *ROW)
-    return runs, left_out + [f"{row['folder']}: another run of the same is newer" for row in older]
+    return runs, left_out
 
 
 def _about(tables: Iterable[Section], runs: Runs, numbers: Mapping[str, int]) -> Section:
@@ -429,8 +435,8 @@ def _figures(runs: Runs, out: Path, curves: Path | None) -> list[Section]:
         for scene, of_scene in plain.by("scene").items():
             rivals = {}  # the last of several budgets or seeds
             for same in of_scene.by("seed", *BUDGET).values():
-                methods = {run["method"]: run for run in same}
-                own = {name: methods[name] for name in METHODS if name in methods}
+                known = sorted(same.where(method=METHODS), key=lambda run: METHODS.index(run["method"]))
+                own = {" ".join([run["method"], *run["words"].values()]): run for run in known}
                 rivals = own if len(own) > 1 else rivals
             if rivals:
                 first = next(iter(rivals.values()))
@@ -471,11 +477,12 @@ def write_ablation(folder: Path, out: Path, published: Path | None = None) -> li
     runs, left_out = _read(folder, paper)
     # Tables that take the method apart; a table scene by scene repeats another.
     tables = [table for table in paper if not table.means and len(table.parts) > 1]
-    known = {row.variant for table in tables for row in table.parts}
+    known, read = {row.variant for table in tables for row in table.parts}, runs
     rest = Runs(r for r in runs.where(preset=AT_REST) if r["ablation"] in known or r["method"] == "backward")
     runs = Runs(run for run in runs.where(ablation=known) if run["preset"] != AT_REST)
     if not runs and not rest:
-        raise ValueError(f"{folder}: expected runs of ablations, but got none; make some with make ablations")
+        takes = "runs of ablation=full, no_tv, no_inpainter, ... with a metrics.json"
+        raise nothing(folder, read, left_out, takes, "make some with make ablations")
     page, files = out / "ablation.md", [out / "ablation.md"]
     earlier = read_text(page) if page.is_file() else ""
     kept = OF_REST.search(earlier)
@@ -516,7 +523,8 @@ def _at_rest(tables: Sequence[PaperTable], runs: Runs) -> dict:
     columns += [Column("steps", 0, spread=False), Column("minutes", 1)]
     lines: list[list[Cell]] = []
     for table in tables:
-        for group, own, _ in _groups(table, runs) if "no_upsampling" in table.variants else ():
+        known = runs.by("setting", *BUDGET).values() if "no_upsampling" in table.variants else ()
+        for group, own, _ in chain(*(_groups(table, same) for same in known)):
             printed, scene = _printed_changes(table, group), ", ".join(group.scenes)
             rows = [(row.name, row.variant, own.where(ablation=row.variant)) for row in table.parts]
             rows.append(("a backward warp (not in the paper)", None, own.where(method="backward")))
@@ -587,7 +595,7 @@ def _changes(
     by_budget: dict[tuple, dict[str, Runs]] = {}
     for of_row in measured(table, runs.where(method="forward"), variants):
         if by_seed(of_row, group, "psnr"):
-            budget = tuple(of_row[0][name] for name in BUDGET)
+            budget = tuple(of_row[0][name] for name in ("setting", *BUDGET))
             by_budget.setdefault(budget, {})[of_row[0]["ablation"]] = of_row
     own = {row.variant for row in table.parts} - {"full"}
     budgets = [found for found in by_budget.values() if "full" in found and own & set(found)]
@@ -650,8 +658,8 @@ def _printed_changes(table: PaperTable, group: Group) -> dict[str, float]:
 
 def _label(run: Row, others: Sequence[Row]) -> str:
     """Name a run's budget, with what else tells it from the others."""
-    parts = budget_of(run)[1:]
-    for name in ("preset", "device", "threads", "clock", "tested", "held_out", "train_views"):
+    parts = [*budget_of(run)[1:], *run["words"].values()]
+    for name in ("preset", "device", "threads", "clock", "tested", "held_out", "train_views", "image_format"):
         several = len({other[name] for other in others}) > 1
         parts += [f"{name.replace('_', ' ').replace('tested', 'views')} {run[name]}"] if several else []
     return ", ".join(parts)

@@ -23,16 +23,21 @@ import yaml
 
 from forewarp.files import MOST_CONFIG, load_json, read_json, read_rows, read_text, replace_file
 from forewarp.metrics.registry import metric_of, take_described
+from forewarp.report.settings import (
+    CONDITIONS,
+    configuration,
+    grouped,
+    key_of,
+    name_settings,
+    repeated,
+    words_of,
+)
 from forewarp.report.statistics import Estimate
 
 Row = dict
 
-# Rows that differ in these are not compared; how each is named where rows differ in it.
-CONDITIONS = {"clock": "{} clock", "threads": "threads: {:g}", "device": "{}", "measured": "{}"}
-CONDITIONS |= {"pictures": "{}", "iterations": "{:g} steps at most", "held_out": "{:g} views held out"}
-CONDITIONS |= {"train_views": "{:g} training views", "density": "stage.fine.density={:g}"}
-CONDITIONS |= {"steps_per_picture": "stage.fine.steps_per_picture={}"}
-KEY = ("method", "preset", "scene", "minutes", "seed", *CONDITIONS)
+KEY = ("method", "preset", "scene", "minutes", "seed", *CONDITIONS, "overrides")
+EARLIER = ("density", "steps_per_picture")  # columns of earlier tables, which ``overrides`` tells
 SCORES = ("psnr", "ssim", "lpips")  # that a table has, whether measured or not
 NUMBERS = ("steps", "step", "frame", "parameters", "memory", "ends", "motion_error")
 NUMBERS += ("psnr_space", "psnr_time", "psnr_canonical", "size", "wall", "processor")
@@ -83,12 +88,6 @@ class Runs(list[Row]):
         keys = sorted(groups, key=_order)
         return {key[0] if len(names) == 1 else key: groups[key] for key in keys}
 
-    def newest(self, *names: str) -> tuple[Runs, Runs]:
-        """Of rows that are equal in ``names`` choose the one measured last; return these, and the others."""
-        last = {key_of(row, names): row for row in sorted(self, key=lambda row: row["measured_at"])}
-        kept = {id(row) for row in last.values()}
-        return Runs(row for row in self if id(row) in kept), Runs(row for row in self if id(row) not in kept)
-
     def by_time(self) -> list[tuple[float, float]]:
         """Average the PSNR of views over the rows: (time, PSNR) of each time, in order."""
         views = grouped(chain(*(pairs(row["views"]) for row in self)))
@@ -110,7 +109,7 @@ class Runs(list[Row]):
             more: more cells.
         """
         estimates = {name: self.estimate(name) for name in (*self.scores(), *NUMBERS, "epe")}
-        return self[0] | {"seeds": len(self)} | estimates | more
+        return self[0] | {"seeds": len({row["seed"] for row in self})} | estimates | more
 
     def paired(self, others: Runs) -> list[tuple[Row, Row]]:
         """Pair the rows with those of ``others`` of the same seed."""
@@ -170,24 +169,12 @@ class Runs(list[Row]):
                 typed = re.sub(r"\s(seed|budget\.clock|threads)=\S+", "", portable(row["command"]))
                 typed += f" budget.clock={row['clock']}" if row["clock"] != "wall" else ""
                 typed += f" threads={row['threads']:g}" if row["threads"] else ""
-                commands.append(overrides(typed))
+                commands.append(words_of(typed))
         words = dict.fromkeys(chain(*commands))
         shared = [word for word in words if all(word in command for command in commands)]
         varied = grouped(word.partition("=")[::2] for word in words if word not in shared)
         listed = [f"`{key}={','.join(values)}`" for key, values in varied.items()]
         return {"shared": " ".join(shared), "varied": listed} if commands else None
-
-
-def grouped(pairs: Iterable[tuple]) -> dict[object, list]:
-    """Gather the values of pairs by their keys.
-
-    >>> grouped([("a", 1), ("b", 2), ("a", 3)])
-    {'a': [1, 3], 'b': [2]}
-    """
-    values: dict[object, list] = {}
-    for key, value in pairs:
-        values.setdefault(key, []).append(value)
-    return values
 
 
 def read_runs(root: Path, needed: Sequence[str] = ("metrics.json",)) -> tuple[Runs, list[str]]:
@@ -229,14 +216,23 @@ def read_runs(root: Path, needed: Sequence[str] = ("metrics.json",)) -> tuple[Ru
     if not runs and not left_out:
         do = "make some with forewarp-train, or set runs=..."
         raise ValueError(f"{root}: expected folders of runs, but got none; {do}")
-    # In names that are typed overrides, drop the overrides that all such runs of a scene share.
-    for of_scene in runs.where(typed=True).by("scene").values():
-        names = [overrides(row["ablation"]) for row in of_scene]
-        shared = set.intersection(*map(set, names)) if len({*map(tuple, names)}) > 1 else set()
-        for row, name in zip(of_scene, names):
-            kept = [override for override in name if override not in shared]
-            row["variant"] = row["ablation"] = " ".join(kept) or "base"
-    return runs, left_out
+    name_settings(runs)
+    older = {id(row) for row in repeated(runs)}
+    folders = [row["folder"].relative_to(root) for row in runs if id(row) in older]
+    left_out += [f"{folder}: another run of the same is newer" for folder in folders]
+    return Runs(row for row in runs if id(row) not in older), left_out
+
+
+def nothing(root: Path, runs: Sequence[Row], left_out: Sequence[str], takes: str, make: str) -> ValueError:
+    """Make the error that a report found no run it takes; ``make``: a command that makes some.
+
+    >>> print(nothing(Path("runs"), [], ["a: no metrics.json"], "runs of minutes", "do"))
+    runs: expected runs of minutes below it, but got none among 1 folder of a run (a: no metrics.json); do
+    """
+    count = len(runs) + len(left_out)
+    why = f" ({left_out[0]})" if left_out else ""
+    among = f"none among {count} folder{'s' * (count != 1)} of a run{why}"
+    return ValueError(f"{root}: expected {takes} below it, but got {among}; {make}")
 
 
 @contextmanager
@@ -257,8 +253,9 @@ def read_run(folder: Path) -> Row:
     ``metrics``, ``plan``, ``points`` of the curve), and
 
     * ``images``: ``name``, ``time``, ``ability``, ``psnr`` and ``scores`` of measured test views;
-    * ``ablation``: name of the run's choice, None without one; ``typed``: whether it is typed overrides;
-    * ``variant``: that name, else method and preset; ``about`` it; ``against``: the variant to compare with;
+    * ``ablation``: name of the run's choice, None without one; ``about`` it; ``against``: the variant to
+      compare with; ``configuration`` as of ``settings``, which names among several runs each one's
+      ``overrides``, ``setting`` and ``variant``;
     * ``ability``: the kind of test view that scores are of: ``all``, else ``time`` (between training times),
       else the first; ``test``: the scores of every kind; ``tested``: number of views scored, None: all;
     * ``train`` (seconds), ``epe`` (world units), ``torch``, ``effects``, ``protocol``;
@@ -268,7 +265,8 @@ def read_run(folder: Path) -> Row:
     stages = {file.parent.name: load_json(file) for file in sorted(folder.glob("*/done.json"))}
     metrics = load_json(folder / "metrics.json") if (folder / "metrics.json").is_file() else {}
     take_described(metrics.get("metrics"))
-    measured_at = (folder / "metrics.json").stat().st_mtime_ns if metrics else 0
+    files = [folder / name for name in ("metrics.json", "score.json") if (folder / name).is_file()]
+    measured_at = files[0].stat().st_mtime_ns if files else 0
     plan = read_text(folder / "plan.yaml", MOST_CONFIG) if (folder / "plan.yaml").is_file() else "{}"
     points, images = read_points(folder), []
     for image in (read_json(folder / "per_image.json") or {}).get("images", []):
@@ -281,7 +279,9 @@ def read_run(folder: Path) -> Row:
 
     protocol, test, flow, sizes = (metrics.get(key) or {} for key in ("protocol", "test", "flow", "size"))
     budget, variant, method = config["budget"], config.get("variant") or {}, config["model"]["name"]
-    ablation = str(variant["name"] or "base") if "name" in variant else None
+    # A name may be what was typed, as the command has it, in folders of earlier versions.
+    named = str(variant.get("name") or "")
+    ablation = named if set(variant) - {"name"} or re.fullmatch(r"[^=~]+", named) else None
     command = str(config.get("command") or f"forewarp-train # as {folder / 'config.yaml'}")
     preset, dataset = config["preset"]["name"], str(protocol.get("dataset", ""))
     synthetic = bool(protocol.get("synthetic")) or ".Synthetic" in str(config["data"].get("_target_", ""))
@@ -290,7 +290,7 @@ def read_run(folder: Path) -> Row:
     row = {"folder": folder, "config": config, "stages": stages, "metrics": metrics, "images": images}
     row |= {"points": points, "plan": yaml.safe_load(plan), "test": test, "measured_at": measured_at}
     row |= {"method": method, "preset": preset, "command": command, "ablation": ablation}
-    row |= {"variant": ablation or f"{method}-{preset}", "typed": set(variant) == {"name"}}
+    row["configuration"] = configuration(config, read_json(folder / "data.json"))
     row |= {"about": variant.get("about", ""), "against": variant.get("against")}
     row |= {"scene": str(config["data"]["scene"]), "seed": int(config["seed"])}
     row |= {"minutes": budget["minutes"], "iterations": budget.get("iterations")}
@@ -307,13 +307,11 @@ def read_run(folder: Path) -> Row:
     row |= {"curve": " ".join(f"{point.seconds:.1f}:{point.psnr:.2f}" for point in points)}
     views = sorted((image["time"], image["psnr"]) for image in images)
     row |= {"views": " ".join(f"{time:.4f}:{psnr:.2f}" for time, psnr in views), "ends": ends_below(views)}
-    for key, number in (("density", float), ("steps_per_picture", str)):
-        typed = re.search(rf"\sstage\.fine\.{key}=(\S+)", command)
-        row[key] = number(typed[1]) if typed else None
-
     known = [key for key in PROTOCOL if protocol.get(key) or (key == "canonical_time" and key in protocol)]
     told = [f"{key.replace('_', ' ')} {_text(protocol[key])}" for key in known]
     row["pictures"] = pictures_in_words(protocol)
+    known = [(name, protocol.get(name)) for name in ("half_resolution", "scale", "background")]
+    row["image_format"] = ", ".join(f"{name.replace('_', ' ')} {v}" for name, v in known if v is not None)
     words = [dataset, row["pictures"] or "background unknown", *told, protocol.get("note")]
     row["protocol"] = ", ".join(filter(None, words))
 
@@ -334,7 +332,9 @@ def read_run(folder: Path) -> Row:
     nets = [scores[f"lpips_{net}"] for net in NETS if scores.get(f"lpips_{net}") is not None]
     shown = {n: score for n, score in scores.items() if metric_of(n).summary and not n.startswith("lpips_")}
     scores = dict.fromkeys(SCORES) | shown | {"lpips": nets[0] if nets else None}
-    return row | scores | {"scores": scores}
+    row |= scores | {"scores": scores}
+    name_settings([row])
+    return row
 
 
 def read_compared(folders: Sequence[str | Path]) -> dict[str, Row]:
@@ -400,28 +400,15 @@ def ends_below(views: Sequence[tuple[float, float]]) -> float | None:
     return statistics.median(others) - statistics.fmean(ends) if ends and others else None
 
 
-def overrides(name: str) -> list[str]:
-    """Split a name into its typed overrides, without spaces inside them.
-
-    >>> overrides("preset.rays=64 stage.fine.num_voxels=[[0, 8000]] ~stage.coarse")
-    ['preset.rays=64', 'stage.fine.num_voxels=[[0,8000]]', '~stage.coarse']
-    """
-    return [re.sub(r"\s", "", part) for part in re.split(r"\s+(?=[+~]|[\w./]+=)", name) if part]
-
-
 def add_rows(file: Path, rows: Iterable[Row]) -> Runs:
     """Add rows to those of a CSV file, which is written; return all.
 
-    Of rows with the same ``KEY`` the one measured last stays; a run beats a row of its day.
-
-    Raises:
-        ValueError: if there would be no row.
+    Of rows with the same ``KEY`` the one measured last stays; a run beats a row of its day. Each gets its
+    ``setting`` among all of them.
     """
     known = [_read(row) for row in read_rows(file)]
     known += sorted(rows, key=lambda row: row["measured_at"])
-    if not known:
-        expected = "measured runs that ended after minutes, but got none; set budget.minutes"
-        raise ValueError(f"runs: expected {expected}")
+    name_settings(known)
     last = {key_of(row, KEY): row for row in sorted(known, key=lambda row: row["day"] or "")}
     runs = Runs(last[key] for key in sorted(last, key=_order))
     text, fields = io.StringIO(), (*KEY, *runs.scores(), *NUMBERS, *TEXTS)
@@ -434,24 +421,19 @@ def add_rows(file: Path, rows: Iterable[Row]) -> Runs:
 
 def _read(row: dict[str, str]) -> Row:
     """Turn a row of a CSV file into one of ``read_run``; an older table lacks some columns."""
-    scores = [*SCORES, *(name for name in row if name not in (*KEY, *SCORES, *NUMBERS, *TEXTS))]
-    numbers = ("minutes", "threads", "iterations", "held_out", "train_views", "density", *scores, *NUMBERS)
+    known = (*KEY, *SCORES, *NUMBERS, *TEXTS, *EARLIER)
+    scores = [*SCORES, *(name for name in row if name not in known)]
+    numbers = ("minutes", "threads", "iterations", "held_out", "train_views", *scores, *NUMBERS)
     typed = {name: row.get(name) or None for name in (*KEY, *TEXTS)}
     typed |= {name: _number(row.get(name)) for name in numbers}
     if " scene=counterpart_" in (typed["command"] or "") and not typed["dataset"].startswith("counterpart"):
         typed["dataset"] = COUNTERPART + typed["dataset"]
-    typed |= {"seed": int(row["seed"]), "clock": typed["clock"] or "wall"}
+    typed |= {"ablation": None, "seed": int(row["seed"]), "clock": typed["clock"] or "wall"}
     return typed | {"scores": {name: typed[name] for name in scores}}
 
 
 def _number(text: str | None) -> float | None:
     return float(text) if text else None
-
-
-def key_of(row: Row, names: Iterable[str]) -> tuple:
-    """Return a row's values; where all test views were measured, that is None, as in older tables."""
-    every = "measured" in row and (row["measured"] or "").startswith("all ")
-    return tuple(None if every and name == "measured" else row[name] for name in names)
 
 
 def _order(key: tuple) -> list[tuple]:

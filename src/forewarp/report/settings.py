@@ -1,0 +1,271 @@
+"""Tell runs apart by what they compute: which keys of a configuration count, and how a difference is named.
+
+Runs whose configurations are equal in all that counts are repetitions, told apart by their seeds. Any other
+difference is a *setting*, named by the overrides that were typed, or where these do not tell two runs apart
+by the fewest keys that do.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import shlex
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
+
+Row = dict
+
+# Keys of a run's config.yaml that change neither what is computed nor how it is measured, and why. All others
+# count, those of other packages too; so does a callback of another package.
+NOT_COUNTED = {
+    "seed": "what repetitions differ in",
+    "seeds": "how many jobs a sweep has",
+    **dict.fromkeys(
+        ("paths", "run", "data.root"), "where files lie; data.json says whether they are the same"
+    ),
+    **dict.fromkeys(("data.cache_bytes", "data.disk_cache_bytes"), "memory, and no frame"),
+    **dict.fromkeys(("trainer.accelerator", "trainer.devices", "threads"), "the protocol says what computed"),
+    **dict.fromkeys(("views", "reduce"), "the protocol says which views were measured, and how large"),
+    **dict.fromkeys(("logger", "viewer", "host", "port", "sheets"), "what is shown meanwhile"),
+    **dict.fromkeys(("evaluate", "score", "lpips_weights"), "what is measured, not how"),
+    **dict.fromkeys(("checkpoint_seconds", "resume", "trust", "absent", "data_changed"), "how the job runs"),
+    **dict.fromkeys(("command", "variant", "debug"), "names; a debug run is left out as a whole"),
+    **dict.fromkeys(("capture", "effects", "plan", "planned"), "what chose the effects, which count"),
+}
+WATCHERS = "forewarp."  # callbacks below it only watch
+# Typed keys whose choice every row has in a column or in its ``CONDITIONS``.
+TOLD = {"model", "preset", "ablation", "experiment", "dataset", "scene", "data", "data.scene", "windows"}
+TOLD |= {"data.held_out", "data.half_resolution", "data.scale", "trainer"}
+TOLD |= {"sweeps", "launcher", "budget.minutes", "budget.iterations", "budget.clock", "budget"}
+
+# Rows that differ in these are not compared; how each is named where rows differ in it.
+CONDITIONS = {"clock": "{} clock", "threads": "threads: {:g}", "device": "{}", "measured": "{}"}
+CONDITIONS |= {"pictures": "{}", "iterations": "{:g} steps at most", "held_out": "{:g} views held out"}
+CONDITIONS |= {"train_views": "{:g} training views"}
+# What runs that only differ in the seed share, beside their configuration.
+SAME = ("dataset", "scene", "method", "preset", "ablation", "minutes", *CONDITIONS)
+
+
+def key_of(row: Row, names: Iterable[str]) -> tuple:
+    """Return a row's values; where all test views were measured, that is None, as in older tables."""
+    every = "measured" in row and (row["measured"] or "").startswith("all ")
+    return tuple(None if every and name == "measured" else row[name] for name in names)
+
+
+def words_of(name: str) -> list[str]:
+    """Split a setting or a command into its overrides, without spaces inside them.
+
+    >>> words_of("preset.rays=64 stage.fine.num_voxels=[[0, 8000]] ~stage.coarse")
+    ['preset.rays=64', 'stage.fine.num_voxels=[[0,8000]]', '~stage.coarse']
+    """
+    return [re.sub(r"\s", "", part) for part in re.split(r"\s+(?=[+~]|[\w./]+=)", name) if part]
+
+
+def counts(key: str) -> bool:
+    """Tell whether a key, dotted or of a group, changes what a run computes.
+
+    >>> counts("data.root"), counts("logger.csv.name"), counts("data.box"), counts("runner")
+    (False, False, True, True)
+    """
+    parts = re.split(r"[./]", key)
+    return not any(".".join(parts[:n]) in NOT_COUNTED for n in range(1, len(parts) + 1))
+
+
+def configuration(config: Mapping, files: object = None) -> dict[str, object]:
+    """Return what counts of a run's configuration: dotted key -> value; a key that is null has no entry.
+
+    Of a run that planned its effects (``effects: auto``) what the plan chose does not count, which may differ
+    from seed to seed, but what was typed does.
+
+    Args:
+        config: the content of ``config.yaml``.
+        files: the fingerprint of the scene's files, if there is one.
+    """
+    found = {key: value for key, value in flat(config) if counts(key) and value is not None}
+    found = {key: value for key, value in found.items() if not key.startswith("callbacks.")}
+    for name, callback in (config.get("callbacks") or {}).items():
+        if callback and not str(callback.get("_target_")).startswith(WATCHERS):
+            found |= {f"callbacks.{name}.{key}": value for key, value in flat(callback)}
+    if found.get("data.seed") == config.get("seed"):
+        found.pop("data.seed", None)
+    if start := found.get("start"):  # of the same seed, where windows of a film have several
+        found["start"] = re.sub(rf"seed{config.get('seed')}\b", "seed", str(start))
+    for name, stage in (config.get("stage") or {}).items():  # repeats objective.<name>
+        if (stage or {}).get("objective") == (config.get("objective") or {}).get(name):
+            found = {key: v for key, v in found.items() if not key.startswith(f"stage.{name}.objective.")}
+    if config.get("effects") == "auto":
+        decided = re.compile(r"model\.(?!name$|_target_$)|stage\.\w+\.effects$|preset\.")
+        found = {key: value for key, value in found.items() if not decided.match(key)}
+        found |= typed(str(config.get("command")))
+    if files:
+        found["data.files"] = json.dumps(files, sort_keys=True)
+    return found
+
+
+def flat(content: object, key: str = "") -> Iterator[tuple[str, object]]:
+    """Yield the dotted keys and the values of nested mappings; a list is one value, and 1 is 1.0.
+
+    >>> dict(flat({"a": {"b": 1, "c": [1, 2]}, "d": None}))
+    {'a.b': 1.0, 'a.c': '[1.0, 2.0]', 'd': None}
+    """
+    if isinstance(content, Mapping):
+        for name, value in content.items():
+            yield from flat(value, f"{key}.{name}" if key else str(name))
+    elif isinstance(content, list):
+        yield key, json.dumps([value for part in content for _, value in flat(part)])
+    else:
+        is_bool = isinstance(content, bool)
+        yield key, json.dumps(content) if is_bool else float(content) if isinstance(content, int) else content
+
+
+def typed(command: str) -> dict[str, str]:
+    """Return the overrides of a command that count and that no column tells: key -> override, as typed.
+
+    >>> typed("forewarp-train seed=1 model=forward logger=csv 'preset.rays=64' ~stage.coarse")
+    {'preset.rays': 'preset.rays=64', 'stage.coarse': '~stage.coarse'}
+    """
+    words = []
+    with suppress(ValueError):  # quotes that do not end
+        words = [word for word in shlex.split(command.partition(" #")[0]) if "=" in word or word[0] == "~"]
+    known = {re.split(r"=", word)[0].lstrip("+~"): re.sub(r"\s", "", word) for word in words}
+    own = {key: word for key, word in known.items() if key not in TOLD and counts(key)}
+    return {key: word for key, word in own.items() if not key.startswith(("-", "hydra."))}
+
+
+def name_settings(rows: Sequence[Row]) -> None:
+    """Give rows their ``overrides``, ``setting``, ``words`` and ``variant``.
+
+    ``overrides`` has the typed overrides that count and, where two configurations would share these under the
+    same conditions, more keys. ``setting`` is that without what all rows share on each scene, and does not
+    depend on the scene; ``words`` are the same by their keys, with keys as short as they are
+    unambiguous. ``variant`` names a row among these: its ablation, or its method and preset where rows differ
+    in them, and its words; ``base`` for a row without any of those that others of its method and preset have.
+
+    A row of a CSV file has no ``configuration``: the ``overrides`` stored there tell, or else its command.
+    """
+    words: dict[int, dict[str, str]] = {}
+    for family in grouped((family_of(row), row) for row in rows).values():
+        words |= _overrides(family)
+    for row in rows:
+        row["overrides"] = _text(words[id(row)])
+    kept = set()
+    for of_scene in grouped((row["scene"], words[id(row)]) for row in rows).values():
+        every = {key for of_row in of_scene for key in of_row}
+        kept |= {key for key in every if len({of_row.get(key) for of_row in of_scene}) > 1}
+    words = {row: {key: word for key, word in own.items() if key in kept} for row, own in words.items()}
+    short = shortest({key for of_row in words.values() for key in of_row})
+    plain = grouped((family_of(row), row) for row in rows if family_of(row)[-1] is None)
+    counted = {name: len({_text(words[id(row)]) for row in found}) for name, found in plain.items()}
+    main = max(counted, key=counted.get, default=None)
+    for row in rows:
+        own = words[id(row)]
+        shown = {key: word.lstrip("+").replace(key, short[key], 1) for key, word in own.items()}
+        is_main = row["ablation"] == "base" or (family_of(row) == main and counted[main] > 1)
+        begin = family_of(row)[-1] or ("" if is_main else f"{row['method']}-{row['preset']}")
+        row |= {"setting": _text(own), "words": shown}
+        row["variant"] = " ".join(filter(None, (begin, _text(shown)))) or "base"
+    for same in grouped((row["variant"], row) for row in rows).values():
+        if len({*map(family_of, same)}) > 1:
+            for row in same:
+                row["variant"] = f"{row['method']}-{row['preset']} {row['variant']}"
+
+
+def family_of(row: Row) -> tuple[str, str, str | None]:
+    """Return method, preset and ablation; None for the preset as it is, which ``ablation=base`` names."""
+    return row["method"], row["preset"], None if row["ablation"] == "base" else row["ablation"]
+
+
+def _text(words: Mapping[str, str]) -> str:
+    return " ".join(words.values())
+
+
+def _overrides(family: Sequence[Row]) -> dict[int, dict[str, str]]:
+    """Return each row's overrides by their keys, by its id; rows are of one method, preset and ablation."""
+    words: dict[int, dict[str, str]] = {}
+    for same in grouped(((row["scene"], _identity(row)), row) for row in family).values():
+        known = [_stored(row) for row in same]
+        shared = [key for key in sorted(known[0]) if all(key in of_row for of_row in known)]
+        words |= {id(row): {key: known[0][key] for key in shared} for row in same}
+    configured, used = [row for row in family if row.get("configuration")], set()
+    while key := _telling(configured, words, used):
+        used.add(key)
+        for row in configured:
+            words[id(row)] = dict(
+                sorted((words[id(row)] | _word(key, row["configuration"].get(key))).items())
+            )
+    return words
+
+
+def _word(key: str, value: object) -> dict[str, str]:
+    """Write a key of a configuration as if it were typed; a class is named without its module.
+
+    >>> _word("model.upsampler._target_", "theirs.parts.Learned"), _word("model.blur", 2.0)
+    ({'model.upsampler': 'model.upsampler=Learned'}, {'model.blur': 'model.blur=2'})
+    """
+    name, is_whole = key.removesuffix("._target_"), isinstance(value, float) and value.is_integer()
+    text = "null" if value is None else str(int(value)) if is_whole else "".join(str(value).split())
+    return {name: f"{name}={text.rpartition('.')[2] if name != key else text}"}
+
+
+def _identity(row: Row) -> object:
+    """Tell which configuration a row has; of a row of a CSV file, what its command tells."""
+    own = row.get("configuration")
+    return frozenset(own.items()) if own else tuple(_stored(row).values())
+
+
+def _stored(row: Row) -> dict[str, str]:
+    """Return the overrides of a row by their keys."""
+    if (stored := row.get("overrides")) is None:
+        return typed(row["command"] or "")
+    return {re.split("=", word)[0].lstrip("+~"): word for word in words_of(stored)}
+
+
+def _telling(rows: Sequence[Row], words: Mapping[int, Mapping], used: set[str]) -> str | None:
+    """Choose the key, none of ``used``, that tells the most configurations apart which share their words and
+    conditions; None where all are told apart.
+    """
+    names = "scene", "minutes", *CONDITIONS
+    cells = grouped(((key_of(row, names), _text(words[id(row)])), row["configuration"]) for row in rows)
+    told: dict[str, int] = {}
+    for cell in cells.values():
+        found = list({frozenset(own.items()): own for own in cell}.values())
+        for key in {key for own in found for key in own} - used if len(found) > 1 else ():
+            told[key] = told.get(key, 0) + len({own.get(key) for own in found}) - 1
+    best = max(told.values(), default=0)
+    short = sorted(key for key, count in told.items() if count == best > 0)
+    return min(short, key=lambda key: key.count(".") - 1.5 * key.endswith("._target_"), default=None)
+
+
+def shortest(keys: Iterable[str]) -> dict[str, str]:
+    """Shorten each key to the fewest last parts that no other key ends in.
+
+    >>> shortest(["objective.fine.weights.rigid", "model/motion", "stage.a.lr.x", "stage.b.lr.x"]).values()
+    dict_values(['rigid', 'motion', 'a.lr.x', 'b.lr.x'])
+    """
+    parts = {key: tuple(re.split(r"[./]", key)) for key in keys}
+    found = {}
+    for key, own in parts.items():
+        others = [other for other in parts.values() if other != own]
+        lengths = range(1, len(own) + 1)
+        n = next((n for n in lengths if all(other[-n:] != own[-n:] for other in others)), len(own))
+        found[key] = ".".join(own[-n:])
+    return found
+
+
+def repeated(rows: Sequence[Row]) -> list[Row]:
+    """Return the rows whose configuration, conditions and seed another row has that was measured later."""
+    groups = grouped(((key_of(row, (*SAME, "seed")), _identity(row)), row) for row in rows)
+    ordered = (sorted(same, key=lambda row: row["measured_at"]) for same in groups.values())
+    return [row for same in ordered for row in same[:-1]]
+
+
+def grouped(pairs: Iterable[tuple]) -> dict[object, list]:
+    """Gather the values of pairs by their keys.
+
+    >>> grouped([("a", 1), ("b", 2), ("a", 3)])
+    {'a': [1, 3], 'b': [2]}
+    """
+    values: dict[object, list] = {}
+    for key, value in pairs:
+        values.setdefault(key, []).append(value)
+    return values
