@@ -1,5 +1,5 @@
 .DEFAULT_GOAL := help
-.PHONY: help install install-launchers install-trackers install-browser demo demo-lego-complete demo-hypernerf demo-nhr test test-slow \
+.PHONY: help install install-launchers install-trackers install-browser constraints demo demo-lego-complete demo-hypernerf demo-nhr test test-slow \
 	conformance test-stability bench bench-gpu effects accuracy-time price-list reproduce-tables ablations docs docs-serve \
 	lint format clean
 SHELL := bash
@@ -8,9 +8,9 @@ unexport PYTHONDONTWRITEBYTECODE # what pytest rewrites is compiled once
 PYTHON ?= python3
 BIN := .venv/bin
 # Install forewarp with the extras that follow, from where pip is told to look.
-ADD = links="$$($(BIN)/pip config get global.find-links 2>/dev/null || echo "$$PIP_FIND_LINKS")"; \
-	if [ -n "$$links" ]; then export UV_FIND_LINKS="$$links"; fi; \
-	VIRTUAL_ENV="$$PWD/.venv" $(BIN)/uv pip install --compile-bytecode -c constraints.txt -e
+LINKS = links="$$($(BIN)/pip config get global.find-links 2>/dev/null || echo "$$PIP_FIND_LINKS")"; \
+	if [ -n "$$links" ]; then export UV_FIND_LINKS="$$links"; fi
+ADD = $(LINKS); VIRTUAL_ENV="$$PWD/.venv" $(BIN)/uv pip install --compile-bytecode -c constraints.txt -e
 KEYS := DATA SCENES METHODS MODEL PRESET MINUTES STEPS SEEDS SWEEPS CHANGES VIEWS OUT JOBS THREADS LAUNCHER DEVICE MORE SMALL
 REPRODUCE = $(BIN)/forewarp-reproduce $(1) $(foreach key,$(KEYS),$(if $(findstring command,$(origin $(key))),$(key)='$($(key))'))
 
@@ -29,6 +29,14 @@ install-browser: ## add a headless Chromium and playwright, which test the viewe
 	command -v chromium >/dev/null || { apt-get update -qq && \
 		apt-get install -y -qq --no-install-recommends chromium fonts-dejavu-core >/dev/null; }
 	$(ADD) '.[browser]'
+constraints: ## write constraints.txt anew: the versions installed here, once .ci/run has passed with them
+	@$(LINKS); $(BIN)/uv pip freeze -q --exclude-editable | sed -n 's/^\([^ @]*==[^+ ]*\)\(+.*\)\?$$/\1/p' > constraints.new
+	@$(LINKS); $(BIN)/uv pip compile -q --universal --python-version 3.10 --no-header --no-annotate pyproject.toml \
+		$(foreach extra,cpu synth plots viewer export usd capture dev trackers browser docs,--extra $(extra)) -o constraints.new
+	@{ sed -n '/^#/p' constraints.txt; grep -vE '^($(UNPINNED))' constraints.new; } > constraints.both && rm constraints.new
+	@mv constraints.both constraints.txt && wc -l constraints.txt
+# Chosen by platform, or wanted in other versions by launchers of sweeps and by MLflow.
+UNPINNED = nvidia-|cuda-|triton=|pywin32=|waitress=|colorama=|setuptools=|sqlalchemy=|cloudpickle=|joblib=|alembic=
 
 demo: ## fit the procedural vehicle by three methods, two at once, compare, make a video and a page (about three minutes of two cores) [MINUTES=]
 	$(BIN)/forewarp-reproduce demo $(if $(MINUTES),minutes=$(MINUTES))

@@ -147,6 +147,8 @@ def test_what_is_typed_trains_and_trains_again_without_trust(ok, found, sheen):
     assert config["data"]["_target_"] == "mine.data.MineDataModule"
     assert config["model"]["view_dependence"]["_target_"] == "mine.effects.Sheen"
     assert config["trust"] is None
+    code = json.loads((sheen / "metrics.json").read_text())["protocol"]["code"]
+    assert (code["mine"], set(code)) == ({"version": "0.1"}, {"forewarp", "mine"})
     assert "mine/psnr" in (sheen / "plain" / "metrics.csv").read_text()
     words = ["train", *found, *SHEEN, "run=run"]
     assert ok(*words).out.startswith("measured before")

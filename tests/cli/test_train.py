@@ -3,6 +3,7 @@
 import json
 import os
 import shutil
+from importlib.metadata import version
 
 import lightning
 import pytest
@@ -62,6 +63,7 @@ def numbers(folder):
 def test_a_run_leaves_what_it_promises_and_says_so(fitted):
     for name in ("config.yaml", "metrics.json", "per_image.json", "coarse/handover.json", "coarse/last.ckpt"):
         assert (fitted / name).is_file()
+    assert f"torch=={version('torch')}" in (fitted / "packages.txt").read_text().split()
     assert (fitted / "fine" / "last.ckpt").is_file()
     assert len(list((fitted / "images").glob("test_*/*.png"))) == 5
     assert len(list((fitted / "images" / "sheets").rglob("*.png"))) == 5
@@ -127,7 +129,8 @@ def test_evaluating_again_gives_the_same_numbers_or_others(ok, fitted, copied, s
     assert "canonical" in done.out
     assert numbers(copied) == numbers(fitted)
     path = copied / "fine" / "done.json"
-    path.write_text(json.dumps(read(path) | {"commit": "0123abcde"}))  # by which it was trained, not measured
+    trained_by = {"code": {"forewarp": {"commit": "0123abcde"}}}  # not what measures it
+    path.write_text(json.dumps(read(path) | trained_by))
     ok("evaluate", f"run={copied}", f"data.root={moved}", "reduce=2", "eval_background=black")
     protocol = read(copied / "metrics.json")["protocol"]
     assert (protocol["reduced"], protocol["commit"]) == (2, "0123abcde")

@@ -1,7 +1,6 @@
 import gc
 import json
 import os
-import re
 import resource
 import shutil
 import signal
@@ -170,13 +169,6 @@ def test_elsewhere_the_peak_is_that_of_the_process(monkeypatch, tmp_path):
     unit = 1 if sys.platform == "darwin" else 1024
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit
     assert stages_module.peak_memory_bytes() == peak
-
-
-def test_the_commit_of_the_code_is_known_in_its_checkout_alone(monkeypatch, tmp_path):
-    commit = stages_module.commit.__wrapped__()
-    assert commit is None or re.fullmatch(r"[0-9a-f]{9,}\+?", commit)
-    monkeypatch.setattr(stages_module, "__file__", str(tmp_path / "training" / "stages.py"))
-    assert stages_module.commit.__wrapped__() is None
 
 
 def test_every_stage_counts_its_own_memory(tmp_path, monkeypatch):

@@ -5,9 +5,7 @@ from __future__ import annotations
 import platform
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
-from importlib.metadata import PackageNotFoundError, version
 from itertools import chain, product
 from pathlib import Path
 from statistics import fmean, median
@@ -27,6 +25,7 @@ from forewarp.metrics.geometry import end_point_error
 from forewarp.metrics.registry import METRICS, ImageSuite, described, scores_of_parts, summarise
 from forewarp.ops.grid import block_means, reduced_depth
 from forewarp.progress import time_text
+from forewarp.provenance import versions
 from forewarp.scene.frame import Scene, spread, walk_of
 from forewarp.scene.view import Moment, Rendering, Target, View
 from forewarp.training.module import DynamicSceneModule
@@ -36,7 +35,6 @@ _PAIRS = 24  # of images, between which motion is looked at
 PCK = 0.05  # of an image's longer side, within which a keypoint is where it should be
 _SHEET_SIDE = 300  # least pixels of the shorter side of an image on a sheet
 _LEAST_ALPHA = 0.5 / 255  # 8 bits round it to 0, where stored colours are 0 too
-_PACKAGES = ("forewarp", "torch", "lightning", "torchmetrics", "numba")  # what results depend on
 _PROCESSOR = Path("/proc/cpuinfo")  # Linux only
 
 
@@ -120,8 +118,7 @@ def evaluate(
     """
     scene, targets, images = datamodule.scene, datamodule.targets("test"), folder / "images"
     finished = finished or {}
-    commits = [done["commit"] for done in finished.values() if done.get("commit")]
-    protocol = {**({"commit": commits[-1]} if commits else {}), **(protocol or {})}
+    protocol = {**trained_by(finished, module.method), **(protocol or {})}
     chosen = middles(len(targets), views)
     if len(chosen) < len(targets):
         protocol["measured"] = f"{len(chosen)} of {len(targets)} test views, evenly spread"
@@ -187,6 +184,15 @@ def middles(count: int, wanted: int | None) -> list[int]:
     if wanted is None or wanted >= count:
         return list(range(count))
     return [(2 * i + 1) * count // (2 * wanted) for i in range(wanted)]
+
+
+def trained_by(finished: Mapping[str, Mapping], method: object) -> dict:
+    """Say which ``code`` trained the last stage, by package, and the ``commit`` of the method's own one."""
+    done = list(finished.values())[-1] if finished else {}
+    package = type(method).__module__.partition(".")[0]
+    code = done.get("code") or {"forewarp": {"commit": done.get("commit")}}  # as earlier runs have it
+    commit = code.get(package, {}).get("commit")
+    return ({"code": code} if "code" in done else {}) | ({"commit": commit} if commit else {})
 
 
 def from_training(scene: Scene) -> dict[str, str]:
@@ -396,12 +402,3 @@ def device_name(device: torch.device) -> str:
     about = _PROCESSOR.read_text() if _PROCESSOR.is_file() else ""
     named = re.search(r"^model name\s*:[ \t]*(.*\S)", about, re.MULTILINE)
     return named[1] if named else platform.processor() or platform.machine()
-
-
-def versions() -> dict[str, str]:
-    """Return the versions of Python and of the installed packages that results depend on."""
-    installed = {"python": platform.python_version()}
-    for package in _PACKAGES:
-        with suppress(PackageNotFoundError):
-            installed[package] = version(package)
-    return installed

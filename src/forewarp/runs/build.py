@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 import shlex
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from functools import partial, reduce
 from pathlib import Path
@@ -20,6 +20,7 @@ from omegaconf import DictConfig, OmegaConf
 from forewarp.clock import Clock
 from forewarp.data.files import mismatch, one_of, whole
 from forewarp.data.films import FOLDER
+from forewarp.provenance import RESULTS
 from forewarp.runs.config import IDENTITY, instead_of, plain, saved_config, trust_of
 from forewarp.runs.overrides import TEXTS, key_of
 from forewarp.scene.cloud import Handover
@@ -86,6 +87,7 @@ def build_run(config: DictConfig) -> Run:
         place=device,
         loggers=loggers_of(config),
         start=start_of(config),
+        packages=packages_of(config),
     )
     run.check()
     return run
@@ -136,6 +138,20 @@ def loggers_of(config: DictConfig) -> RunLoggers:
     makers = instantiate(named, _convert_="all")
     runs = OmegaConf.select(config, "paths.runs") or Path(config.run).parent
     return RunLoggers(makers, Path(config.run), Path(runs), partial(hyperparameters, config))
+
+
+def packages_of(config: DictConfig) -> list[str]:
+    """List the packages whose code a config names, forewarp first; but for those that ``versions`` has."""
+
+    def targets(node: object) -> Iterator[str]:
+        for key, value in node.items() if isinstance(node, dict) else enumerate(node):
+            if key == "_target_":
+                yield str(value).partition(".")[0]
+            elif isinstance(value, dict | list):
+                yield from targets(value)
+
+    named = {*targets(OmegaConf.to_container(config))} - {"forewarp", *RESULTS}
+    return ["forewarp", *sorted(named)]
 
 
 def hyperparameters(config: DictConfig) -> dict[str, object]:

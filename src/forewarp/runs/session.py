@@ -16,10 +16,12 @@ from omegaconf import DictConfig, OmegaConf
 
 from forewarp.data.files import LOCK, difference, mismatch, one_of
 from forewarp.files import read_json, read_text, refuse_links, replace_file, write_json
+from forewarp.provenance import installed
 from forewarp.runs.config import IDENTITY, NOT_OF_RUN, make_absolute, read_config
 from forewarp.runs.overrides import command_line, typed_folders, typed_overrides
 from forewarp.training.stages import Run
 
+PACKAGES = "packages.txt"  # all that was installed when the run was last trained
 UNLOCKED = ("videos", "exports", ".page")  # what is written into a run's folder while another may train it
 # Named first in a refusal, as other differences follow from these.
 _TYPED = ("model.name", "data.scene", "data.root", "seed", "preset", "budget")
@@ -41,6 +43,8 @@ def session(run: Run, config: DictConfig, *, finished: bool = False) -> Iterator
     with locked(run.folder):
         claim(config, finished=finished)
         check_data(run, config.get("data_changed", "refuse"))
+        if not finished:
+            replace_file(run.folder / PACKAGES, installed())
         yield
 
 

@@ -6,12 +6,10 @@ import ctypes
 import gc
 import re
 import resource
-import subprocess
 import sys
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
-from functools import cache
 from pathlib import Path
 
 import lightning
@@ -20,6 +18,7 @@ import torch
 from forewarp.clock import Clock
 from forewarp.files import read_json, write_json
 from forewarp.methods.method import Model, Start, parameter_count
+from forewarp.provenance import source_of, versions
 from forewarp.scene.cloud import Handover
 from forewarp.scene.frame import Scene, instants_of
 from forewarp.training import checkpoints
@@ -54,6 +53,7 @@ class Run:
         loggers: its loggers; whoever fits the run closes them (``with run.loggers``).
         start: gives the fitted module of another run, from which the first stage begins, and what it left;
             None: the first stage begins from images.
+        packages: whose code the run is of; ``done.json`` keeps their versions and commits.
     """
 
     datamodule: lightning.LightningDataModule
@@ -70,6 +70,7 @@ class Run:
     place: Callable[[], torch.device] = lambda: torch.device("cpu")
     loggers: RunLoggers = field(default_factory=RunLoggers)
     start: Callable[[], tuple[DynamicSceneModule, Handover]] | None = None
+    packages: Sequence[str] = ("forewarp",)
 
     @property
     def device(self) -> torch.device:
@@ -235,7 +236,7 @@ class Run:
         callbacks = [sentinel, *self.callbacks(settings.name, folder), keeper]
         trainer = self.make_trainer(folder, callbacks, loggers)
         reset_peak_memory()
-        code = commit()  # now, as others may be made before the stage ends
+        code = {name: source_of(name) for name in self.packages}  # now, as the stage may end with others
         with keeper.listening():
             trainer.fit(module, datamodule=self.datamodule, ckpt_path=checkpoint, weights_only=True)
         if module.fraction < 1:  # fit returned early, as when a callback stops it: the stage is not finished
@@ -256,7 +257,8 @@ class Run:
         clock, steps, parameters = module.clock, module.global_step, parameter_count(module.method)
         done = {"seconds": clock.seconds, "clocks": clock.every, "steps": steps, "parameters": parameters}
         done |= {"frames_in_play": in_play, "peak_memory_bytes": peak_memory_bytes()}
-        write_json(folder / "done.json", done | {"skipped_steps": sentinel.skipped, "commit": code})
+        done |= {"skipped_steps": sentinel.skipped, "code": code, "versions": versions()}
+        write_json(folder / "done.json", done)
         if keeper.asked:  # pressed after the stage's last step
             raise KeyboardInterrupt
 
@@ -265,26 +267,6 @@ def _done(folder: Path) -> dict | None:
     """Read a stage's ``done.json``; None if the stage has not ended."""
     done = read_json(folder / "done.json")
     return done if done is not None and {"seconds", "steps"} <= done.keys() else None
-
-
-@cache
-def commit() -> str | None:
-    """Return the commit of the checkout that the package lies in, with a + where its files or its numbers
-    (conf, sweeps) differ; None where there is none. It is looked up once, when a process first asks.
-    """
-    here = Path(__file__).parents[1]
-
-    def git(*words: str) -> str:
-        line = ["git", "-C", str(here), *words]
-        return subprocess.run(line, capture_output=True, text=True, check=True, timeout=10).stdout.strip()
-
-    try:
-        git("ls-files", "--error-unmatch", "__init__.py")  # else the checkout is another project's
-        numbers = [str(folder) for name in ("conf", "sweeps") if (folder := here.parents[1] / name).is_dir()]
-        changed = git("--no-optional-locks", "status", "--porcelain", "--", ".", *numbers)
-        return git("rev-parse", "--short=9", "HEAD") + "+" * bool(changed)
-    except (OSError, subprocess.SubprocessError):
-        return None
 
 
 def reset_peak_memory() -> None:
