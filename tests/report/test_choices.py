@@ -122,7 +122,7 @@ def test_changes_are_against_the_same_seed(tmp_path):
     assert "Of all test views:" in text
     assert "* ball/failed-1.0-seed0: no metrics.json" in text
     lines = file.read_text().splitlines()
-    assert lines[0].startswith("scene,variant,minutes,seed,views,PSNR (dB),SSIM,EPE,s/step,")
+    assert lines[0].startswith("scene,variant,ablation,against,")
     assert len(lines) == 12
 
 

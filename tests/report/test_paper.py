@@ -515,7 +515,7 @@ def test_kinds_of_test_views_and_scenes_have_sections_of_their_own(tmp_path):
         "Table 6: modules: D-NeRF, of which mutant, hook": ["-0.90", "24.00", "-1.00"],
     }
     assert {lines[0][4] for lines in rows.values() if lines} == {"one seed"}
-    assert "No difference here is of three seeds or more: the page gives no verdict." in text
+    assert "No difference here is of three seeds or more, so that there is no verdict." in text
     assert f"{old.relative_to(tmp_path)}: another run of the same is newer" in sections["Left out"]
     with pytest.raises(
         ValueError,

@@ -33,7 +33,7 @@ def test_what_was_called_above_is_not_and_what_was_hidden_is_shown():
 def test_there_is_no_verdict_of_fewer_than_three_pairs(values, words):
     change = Estimate.of(values)
     assert verdict(change) == words
-    assert by_chance([change]) == "No difference here is of three seeds or more: the page gives no verdict."
+    assert by_chance([change]) == "No difference here is of three seeds or more, so that there is no verdict."
     assert rank({name: dict(enumerate(values)) for name in "ab"}) == []
 
 

@@ -18,6 +18,7 @@ forewarp-report makes tables, curves and pages of runs that are already there. O
 
 What one types most:
   runs=FOLDER            searched for runs (runs/accuracy_time, minutes, effects, search, ..., else paper)
+  runs=FILE.csv          a page's own table: write it anew (ablation, effects, methods, minutes, price_list)
   runs=[FOLDER,FOLDER]   compare: the runs themselves; patterns with * are expanded
   out=FOLDER             where the page goes (results/ below the runs); compare: where the picture goes
   target=DB              accuracy_time: PSNR that every variant's seconds are listed for
@@ -82,7 +83,8 @@ def report(config: DictConfig) -> None:
         typed = {"target": config.target, "published": config.published and Path(config.published)}
         typed["curves"] = Path(config.curves or f"{config.paths.runs}/accuracy_time/results")
         options = {name: typed[name] for name in names}
-        out, write = Path(config.out or runs / "results"), resolve_name(f"forewarp.report.{function}")
+        out = Path(config.out or (runs.parent if runs.suffix == ".csv" else runs / "results"))
+        write = resolve_name(f"forewarp.report.{function}")
         print(*(f"written: {file}" for file in write(runs, out, **options)), sep="\n")
 
 

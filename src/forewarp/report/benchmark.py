@@ -22,6 +22,7 @@ from forewarp.report import figures
 from forewarp.report.results import Row, Runs, add_rows, in_words, length, nothing, read_runs
 from forewarp.report.settings import CONDITIONS, grouped, key_of
 from forewarp.report.statistics import LEAST, by_chance, paired_change, rank, verdict
+from forewarp.report.stored import is_stored
 from forewarp.report.tables import Column, Table, rendered, score_columns
 
 OTHERS = Path(__file__).with_name("published.yaml")  # results of others
@@ -95,8 +96,11 @@ def write_minutes(folder: Path, out: Path, published: Path | None = None) -> lis
 
 
 def _timed(folder: Path) -> tuple[Runs, list[str]]:
-    """Read the measured runs of so many minutes, and a line for each other run."""
-    runs, left_out = read_runs(folder)
+    """Read the measured runs of so many minutes, and a line for each other run.
+
+    A table in place of a folder has no further runs: rows of tables are those in ``out``.
+    """
+    runs, left_out = (Runs(), []) if is_stored(folder) else read_runs(folder)
     endless = [f"{row['folder'].relative_to(folder)}: no budget.minutes" for row in runs.where(minutes=None)]
     return Runs(row for row in runs if row["minutes"] is not None), left_out + endless
 
@@ -179,6 +183,10 @@ def _of_method(method: str, runs: Runs, others: Mapping[str, Runs]) -> dict:
     denser = _against_fewer(sized, "density", size_of)
     larger = _larger(runs.where(density=None))
     pictures = with_seeds | {"pictures": "images"} | scores
+
+    def with_chance(rows: list[dict], columns: dict) -> Table:
+        return Table.of(rows, columns, by_chance(row["change"] for row in rows))
+
     costs = BEGIN | {name: replace(column, spread=False) for name, column in COSTS.items()}
     return {
         "method": method,
@@ -188,8 +196,8 @@ def _of_method(method: str, runs: Runs, others: Mapping[str, Runs]) -> dict:
         "each": Table.of(map(row_of, groups), each),
         "beside": {other: _beside(method, runs, other, found) for other, found in others.items()},
         "abilities": Table.of(by_ability, columns),
-        "more_minutes": Table.of(minutes, with_seeds | scores | {"verdict": "against fewer minutes"}),
-        "more_density": Table.of(denser, density | {"verdict": "against fewer"}),
+        "more_minutes": with_chance(minutes, with_seeds | scores | {"verdict": "against fewer minutes"}),
+        "more_density": with_chance(denser, density | {"verdict": "against fewer"}),
         "larger": Table.of(larger, pictures | {"verdict": "the larger is"}),
         "costs": Table.of(map(row_of, groups), costs),
         "command": runs.command(),
@@ -222,7 +230,8 @@ def _against_fewer(runs: Runs, varied: str, order: Callable[[Runs], float]) -> l
     series = grouped((key_of(group[0], shared), group) for group in alike(runs))
     for groups in (sorted(found, key=order) for found in series.values() if len(found) > 1):
         for before, group in zip([None, *groups], groups):
-            lines.append(row_of(group, verdict=above(group, before) if before else ""))
+            change = paired_change(group.paired(before), "psnr") if before else None
+            lines.append(row_of(group, verdict=above(group, before) if before else "", change=change))
     return lines
 
 

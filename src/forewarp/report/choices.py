@@ -21,6 +21,7 @@ from forewarp.report.figures import draw_scene
 from forewarp.report.results import KINDS, PLACES, Point, Row, Runs, in_words, nothing, read_runs
 from forewarp.report.settings import CONDITIONS, family_of, words_of
 from forewarp.report.statistics import FACTORS, Estimate, by_chance, paired_change, verdict
+from forewarp.report.stored import read_any, stored_csv
 from forewarp.report.tables import Column, Difference, Table, rendered, score_columns
 
 COSTS = {"epe": Column("EPE", 4), "step": Column("s/step", 3), "frame": Column("s/frame")}
@@ -52,7 +53,7 @@ def _read(folder: Path, needed: Sequence[str] = ("metrics.json",)) -> tuple[Runs
     Raises:
         ValueError: if there is none.
     """
-    runs, left_out = read_runs(folder, needed)
+    runs, left_out = read_any(folder, needed)
     if not runs:
         takes = f"runs with a config.yaml and {' and '.join(needed)}"
         raise nothing(folder, runs, left_out, takes, "make some with forewarp-train --multirun")
@@ -145,7 +146,7 @@ def write_price_list(folder: Path, out: Path) -> list[Path]:
     page = out / ("price-list.md" if model == "forward" else f"price-list-{model}.md")
     about = {"machine": runs.machines(), "left_out": left_out}
     replace_file(page, rendered("price_list.md.j2", scenes=scenes, **about))
-    replace_file(page.with_suffix(".csv"), every_run(runs).csv())
+    replace_file(page.with_suffix(".csv"), stored_csv(runs))
     return [page, page.with_suffix(".csv")]
 
 
@@ -192,13 +193,6 @@ def changes(runs: Runs) -> Table:
     return Table(columns, lines, f"Changes. {by_chance(differences)}")
 
 
-def every_run(runs: Runs) -> Table:
-    """List the numbers of every run."""
-    columns = {name: name for name in ("scene", "variant", "minutes", "seed")} | {"ability": "views"}
-    columns |= measures_of(runs) | {"effects": "effects", "command": "command"}
-    return Table.of(runs, columns)
-
-
 def write_effects(folder: Path, out: Path) -> list[Path]:
     """Write ``effects.md`` and ``effects.csv`` (every run) of ``model=forward``, and ``effects-<model>`` of
     any other method.
@@ -209,8 +203,6 @@ def write_effects(folder: Path, out: Path) -> list[Path]:
         takes = f"runs of ablation={' or '.join(CHOICES)} with a metrics.json"
         raise nothing(folder, runs, left_out, takes, "make some with make effects")
     runs = _labelled(chosen)
-    columns = {"scene": "scene", "ablation": "choice", "seed": "seed", "minutes": "minutes", "psnr": "PSNR"}
-    columns |= {"steps": "steps", "planning": "planning, s", "command": "command"}
     for model, own in runs.by("method").items():
         page = out / ("effects.md" if model == "forward" else f"effects-{model}.md")
         planned = chain(*own.where(ablation="auto").by("scene", "seed").values())
@@ -221,8 +213,7 @@ def write_effects(folder: Path, out: Path) -> list[Path]:
         reasons = Table(["scene", "effect", "choice", "because"], why)
         replace_file(page, rendered("effects.md.j2", **about, table=choices(own), reasons=reasons))
         rows = chain(*own.by("scene", "ablation", "seed").values())
-        lines = [row | {"planning": row["plan"].get("seconds")} for row in rows]
-        replace_file(page.with_suffix(".csv"), Table.of(lines, columns).csv())
+        replace_file(page.with_suffix(".csv"), stored_csv(Runs(rows)))
         files += [page, page.with_suffix(".csv")]
     return files
 

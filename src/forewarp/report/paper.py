@@ -20,10 +20,10 @@ import yaml
 from forewarp.files import MOST_CONFIG, read_text, replace_file
 from forewarp.metrics.registry import metric_of
 from forewarp.report import figures
-from forewarp.report.choices import every_run
-from forewarp.report.results import KINDS, Point, Row, Runs, nothing, read_runs
+from forewarp.report.results import KINDS, Point, Row, Runs, nothing
 from forewarp.report.settings import grouped
 from forewarp.report.statistics import INTERVALS, LEAST, Estimate, by_chance, rank, verdict
+from forewarp.report.stored import read_any, stored_csv
 from forewarp.report.tables import Cell, Column, Difference, Section, Table, rendered
 
 PAPER = Path(__file__).with_name("paper.yaml")  # the printed numbers
@@ -388,10 +388,11 @@ def _read(folder: Path, tables: Iterable[PaperTable]) -> tuple[Runs, list[str]]:
 
     A protocol names the kind of test view that is shown where columns of ``tables`` name none.
     """
-    runs, left_out = read_runs(folder)
+    runs, left_out = read_any(folder)
     open_kind = {group.dataset for table in tables for group in table.groups if group.ability is None}
     for run in runs:
-        if run["origin"] in open_kind and run["ability"] != "all":
+        run.setdefault("late", late_gain(run["points"]))
+        if run["origin"] in open_kind and run["ability"] != "all" and ", scores of " not in run["protocol"]:
             run["protocol"] += f", scores of test views {KINDS.get(run['ability'], run['ability'])}"
     return runs, left_out
 
@@ -492,7 +493,7 @@ def write_ablation(folder: Path, out: Path, published: Path | None = None) -> li
     replace_file(page, f"{before.rstrip()}\n\n{part.strip()}\n{heading}{after}" if part else text)
     for found, name in ((runs, "ablation.csv"), (rest, "ablation-at-rest.csv")):
         if found:
-            replace_file(out / name, every_run(found).csv())
+            replace_file(out / name, stored_csv(found))
             files.append(out / name)
     return files
 
@@ -533,7 +534,7 @@ def _at_rest(tables: Sequence[PaperTable], runs: Runs) -> dict:
                 if scores:
                     change = _change(scores, psnr[0]) if variant != "full" else None
                     order = order_of(change, printed.get(variant))
-                    late = Estimate.of(late_gain(run["points"]) for run in of_row)
+                    late = of_row.estimate("late")
                     line = [scene, name, printed.get(variant), Estimate.of(scores.values()), change, order]
                     took = of_row.mean("train")
                     line += [of_row.estimate("psnr_canonical"), late]

@@ -18,7 +18,7 @@ FACTORS = ("step", "frame", "memory", "parameters", "steps")  # measures that ch
 SEEDS = ("no pair", "one seed", "two seeds")  # in place of a verdict
 INTERVALS = "± is half the 95 % confidence interval of a mean (Student's t over the seeds)"
 INTERVALS += "; of two seeds both values are in brackets"
-NO_VERDICTS = "No difference here is of three seeds or more: the page gives no verdict."
+NO_VERDICTS = "No difference here is of three seeds or more, so that there is no verdict."
 
 
 @dataclass(frozen=True)
