@@ -2,7 +2,7 @@
 forewarp-report makes tables, curves and pages of runs that are already there. Only kind=run renders anything.
 
   kind=accuracy_time  accuracy against training time, and the cheapest way to each dB
-  kind=price_list     what each choice costs and brings, with the spread over seeds
+  kind=price_list     what each choice costs and brings, with intervals over seeds
   kind=paper          the paper's tables and figures: Markdown, LaTeX, CSV, HTML
   kind=ablation       what each part of the paper's method brings, and whether the paper's order holds
   kind=minutes        what each method reaches on each scene in so many minutes, by seed and view

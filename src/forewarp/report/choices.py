@@ -116,7 +116,7 @@ def cheapest(groups: Mapping[tuple, Runs]) -> Table:
             seconds, row = min(known, key=lambda pair: pair[0].mean)
             lines.append([str(psnr), seconds, row["variant"], f"`{row['command']}`"])
     columns = ["for dB", Column("seconds", 1), "variant", "command"]
-    return Table(columns, lines, "The cheapest way to each PSNR:")
+    return Table(columns, lines, "The cheapest way to each PSNR, by the means:")
 
 
 def variants(groups: Mapping[tuple, Runs], target: float) -> Table:
