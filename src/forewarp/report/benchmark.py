@@ -73,12 +73,12 @@ def write_minutes(folder: Path, out: Path, published: Path | None = None) -> lis
     """
     others = read_published(published)
     runs, left_out = _timed(folder)
-    if not runs:
-        raise _nothing(folder, runs, left_out)
     methods, written = {row["method"] for row in runs}, []
     for file in out.glob("*.csv"):  # of earlier calls
         named = {row.get("method") for row in read_rows(file)}
         methods |= named if named == {file.stem} and file.with_suffix(".md").is_file() else set()
+    if not runs and not (is_stored(folder) and methods):
+        raise _nothing(folder, runs, left_out)
     rows = {name: added(out / f"{name}.csv", runs.where(method=name)) for name in sorted(methods)}
     tables = {method: labelled(own) for method, own in rows.items()}
     for method, own in tables.items():

@@ -58,7 +58,8 @@ def _read(folder: Path, needed: Sequence[str] = ("metrics.json",)) -> tuple[Runs
         takes = f"runs with a config.yaml and {' and '.join(needed)}"
         raise nothing(folder, runs, left_out, takes, "make some with forewarp-train --multirun")
     for row in runs:
-        if row["train_views"] and "train_views" not in row["variant"]:
+        told = row["scene"].endswith(" training views)")  # in a table that a page wrote
+        if row["train_views"] and "train_views" not in row["variant"] and not told:
             row["scene"] += f" ({row['train_views']} training views)"
     names = [name for name in CONDITIONS if name != "train_views"]
     for same in runs.by("scene", "variant", "minutes").values():

@@ -14,10 +14,11 @@ from pathlib import Path
 
 from forewarp.files import read_rows
 from forewarp.report.results import SCORES, Point, Row, Runs, pairs, read_runs
+from forewarp.report.settings import name_settings
 
 TEXTS = ("scene", "variant", "ablation", "against", "about", "method", "preset", "ability", "effects")
 TEXTS += ("clock", "device", "torch", "measured", "pictures", "dataset", "origin", "protocol", "day", "curve")
-TEXTS += ("command",)
+TEXTS += ("image_format", "command")
 WHOLE = ("seed", "iterations", "held_out", "train_views", "tested", "counterpart", "steps")
 NUMBERS = ("minutes", "threads", "step", "train", "frame", "memory", "parameters", "epe", "late", *WHOLE)
 OF_KIND = "test "  # begins the column of a score of a kind of test view, as in ``test space psnr``
@@ -37,7 +38,7 @@ def stored_csv(runs: Runs) -> str:
     """Return the text of a CSV file with all that pages of choices show of runs."""
     kinds = ((kind, name) for row in runs for kind, scores in row["test"].items() for name in scores)
     of_kind = {f"{OF_KIND}{kind} {name}": (kind, name) for kind, name in kinds}
-    file, fields = io.StringIO(), [*TEXTS, *NUMBERS, *runs.scores(), *of_kind, "plan"]
+    file, fields = io.StringIO(), [*TEXTS, "overrides", *NUMBERS, *runs.scores(), *of_kind, "plan"]
     writer = csv.DictWriter(file, fields, extrasaction="ignore", lineterminator="\n")
     writer.writeheader()
     for row in runs:
@@ -57,18 +58,22 @@ def read_stored(file: Path) -> Runs:
     if not rows or not {"scene", "variant", "seed"} <= set(rows[0]):
         expected = "a CSV file of a page, with the columns scene, variant and seed"
         raise ValueError(f"runs: expected {expected}, but got {file}; name a folder with runs")
-    return Runs(_row(line, Path(f"{file}:{number}"), number) for number, line in enumerate(rows, 2))
+    runs = Runs(_row(line, Path(f"{file}:{number}"), number) for number, line in enumerate(rows, 2))
+    name_settings(runs)
+    return runs
 
 
 def _row(line: dict[str, str], place: Path, number: int) -> Row:
     row = {name: line.get(name) or None for name in TEXTS}
     row |= {name: float(line[name]) if line.get(name) else None for name in NUMBERS}
     row |= {name: int(row[name]) for name in WHOLE if row[name] is not None}
-    row |= {"counterpart": bool(row["counterpart"])} | {n: row[n] or "" for n in ("effects", "about")}
-    row |= {"typed": False, "folder": place, "measured_at": number, "images": [], "config": {}, "metrics": {}}
+    row |= {name: row[name] or "" for name in ("effects", "about", "image_format")}
+    row |= {"counterpart": bool(row["counterpart"])}
+    row |= {"overrides": line.get("overrides"), "folder": place, "measured_at": number}
+    row |= {"images": [], "config": {}, "metrics": {}}
     row |= {"points": tuple(Point(seconds, psnr, 0) for seconds, psnr in pairs(row["curve"]))}
     row |= {"plan": json.loads(line.get("plan") or "{}"), "test": {}}
-    others = {*TEXTS, *NUMBERS, "plan"}
+    others = {*TEXTS, *NUMBERS, "overrides", "plan"}
     scores = dict.fromkeys(SCORES) | {n: float(v) if v else None for n, v in line.items() if n not in others}
     for column in [name for name in scores if name.startswith(OF_KIND)]:
         kind, name = column.removeprefix(OF_KIND).split(" ", 1)
