@@ -1,6 +1,7 @@
 import json
 import platform
 from dataclasses import replace
+from functools import partial
 
 import imageio.v3 as iio
 import pytest
@@ -10,6 +11,7 @@ from forewarp.data.batches import Targets, color_of
 from forewarp.data.module import SceneDataModule
 from forewarp.evaluation import evaluate as evaluation
 from forewarp.evaluation.evaluate import (
+    RenderedView,
     draw,
     evaluate,
     flow_error,
@@ -18,12 +20,22 @@ from forewarp.evaluation.evaluate import (
     show,
     without,
 )
+from forewarp.methods.method import parameter_count
+from forewarp.methods.voxel.effects import LearnedUpsampler
 from forewarp.methods.voxel.model import VoxelSnapshot
 from forewarp.metrics.registry import LPIPS_METRICS, ImageSuite
 from forewarp.scene.camera import joined
 from forewarp.scene.frame import Truth
 from forewarp.scene.view import Rendering
-from tests.support.tiny_scene import ball_data, ball_scene, frame_at, make_run, stage
+from tests.support.tiny_scene import (
+    INPAINTER,
+    ball_data,
+    ball_scene,
+    forward_model,
+    frame_at,
+    make_run,
+    stage,
+)
 
 
 @pytest.fixture(scope="module")
@@ -70,6 +82,35 @@ def test_scores_every_image_and_saves_it(run, module, tmp_path):
     again = evaluate(module, run.datamodule, tmp_path / "again", ImageSuite(), sheets=0)
     assert again["test"] == metrics["test"]
     assert not (tmp_path / "again" / "images" / "sheets").exists()
+
+
+def test_depth_is_drawn_in_the_colours_of_the_true_one(run, module, tmp_path):
+    scene = run.datamodule.scene
+    near, far = torch.full((24, 24), 2.0), torch.full((24, 24), 4.0)
+    true = torch.where(torch.arange(24) < 8, 0.0, torch.where(torch.arange(24) < 16, near, far))
+    test = tuple(replace(frame, load_depth=lambda: true) for frame in scene.test[:1])
+    target = Targets(test, torch.ones(3), has_alpha=True)[0]
+    depth = torch.where(true == 4, 3.2, torch.where(true == 2, 2.0, 7.0))
+    rendering = Rendering(torch.ones(576, 3), depth.flatten(), (true > 0).float().flatten())
+    of_truth, of_rendering, error = evaluation._depth_parts(rendering, target)
+    assert bool((of_truth[:5, :8] == 1).all())  # the background is white
+    assert bool((of_rendering[:5, :8] == 1).all())
+    assert torch.allclose(of_truth[0, 8], of_rendering[0, 8])  # 2 as 2
+    assert not torch.allclose(of_truth[0, 20], of_rendering[0, 20])
+    assert bool((error[0, :16] == 0).all())
+    assert torch.allclose(error[0, 20], torch.tensor([1.0, 1.0, 0.9]))  # a factor of 1.25 and more
+    evaluation._save(RenderedView(0, target, {"warped": rendering}, 0.0, 0.0), tmp_path, True)
+    assert iio.imread(tmp_path / "depth" / "t_0.png").shape == (312, 3 * 312 + 2 * 4, 3)
+
+
+def test_a_network_is_described_beside_the_numbers(tmp_path):
+    changes = {"inpainter": INPAINTER, "upsampler": partial(LearnedUpsampler, width=8)}
+    run = make_run(tmp_path, [stage(iterations=1)], model=forward_model(**changes))
+    module = run.fit()
+    evaluate(module, run.datamodule, tmp_path, ImageSuite(), views=1)
+    steps = json.loads((tmp_path / "networks.json").read_text())["inpainter"]
+    own = (module.method.inpainter, module.method.upsampler)
+    assert sum(step["parameters"] for step in steps) == sum(map(parameter_count, own))
 
 
 def test_what_moves_is_scored_apart(run, module, tmp_path, capsys):

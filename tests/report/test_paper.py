@@ -4,6 +4,8 @@ import base64
 import json
 import os
 import re
+import shutil
+import subprocess
 import sys
 from itertools import product
 
@@ -54,9 +56,9 @@ def table_of(root, key="dnerf"):
 
 def cells(table, name=OURS, kind="measured"):
     """The scores of the first row of this kind, of measured ones of this name."""
-    rows = enumerate(table.rows)
-    at = next(i for i, row in rows if row[1] == kind and (kind != "measured" or row[0] == name))
-    return table.texts("md")[at][2 : -len(COSTS)]
+    rows, of_kind = enumerate(table.rows), [column.name for column in table.columns].index("kind")
+    at = next(i for i, row in rows if row[of_kind] == kind and (kind != "measured" or row[0] == name))
+    return table.texts("md")[at][of_kind + 1 : -len(COSTS)]
 
 
 def test_a_mean_is_of_all_scenes_or_empty(tmp_path):
@@ -64,7 +66,7 @@ def test_a_mean_is_of_all_scenes_or_empty(tmp_path):
         paper_run(tmp_path, scene, psnr=20.0 + number)
     assert cells(table_of(tmp_path)) == ["", "", ""]
     scenes = table_of(tmp_path, "dnerf_scenes")
-    values = dict(zip([column.name for column in scenes.columns][2:], cells(scenes)))
+    values = dict(zip([column.name for column in scenes.columns][3:], cells(scenes)))
     assert values["Hook PSNR↑"] == "22.00"
     assert values["Hook LPIPS↓"] == values["Mean of 8 PSNR↑"] == values["Jumping Jacks PSNR↑"] == ""
     assert values["Mean of the 7 measured PSNR↑"] == "23.00"
@@ -100,8 +102,8 @@ def test_some_training_views_neither_replace_nor_join_all_of_them(tmp_path):
         paper_run(tmp_path / "some", "toy", seed=seed, made=True, psnr=20.0, protocol={"train_views": 16})
     write_paper(tmp_path, tmp_path / "out")
     text = re.sub(" +", " ", (tmp_path / "out" / "paper.md").read_text())
-    assert f"| {OURS} | 30.00 |" in text
-    assert f"| {OURS}, 2 seeds, 16 training views | 20.00 (20.00, 20.00) |" in text
+    assert f"| {OURS} | PC | 30.00 |" in text
+    assert f"| {OURS}, 2 seeds, 16 training views | PC | 20.00 (20.00, 20.00) |" in text
     assert "is newer" not in text
 
 
@@ -177,25 +179,24 @@ def test_pages_tell_how_numbers_came_about(whole):
     assert re.search(r"\* date: \d{4}-\d\d-\d\d\n\* command, one of \d runs: forewarp-train variant=", text)
     assert "## Table 3" not in text
     lines = re.sub(" +", " ", text)
-    for method in ("particles", "forward (the paper's method)", "backward"):
-        assert f"| forewarp: {method} | measured |" in lines
-    assert "| Ours (80^3) | published | 32.68 | 0.97 | 0.04 |" in lines
+    for method, kind in (("particles", "–"), ("forward (the paper's method)", "PC"), ("backward", "PC")):
+        assert f"| forewarp: {method} | {kind} | measured |" in lines
+    assert "| Ours (80^3) | PC | published | 32.68 | 0.97 | 0.04 |" in lines
     names = {path.name for path in whole.glob("paper-*.png")}
-    views = {f"paper-views-dnerf-{method}.png" for method in ("forward", "particles")}
-    assert names == {"paper-resolution.png", "paper-canonical-hook.png", *views}
+    assert names == {"paper-resolution.png", "paper-canonical-hook.png", "paper-views-dnerf-hook.png"}
     assert "# machine: a cpu, 2 threads" in (whole / "paper-table-1-d-nerf.csv").read_text()
     page = (whole / "paper.html").read_text()  # needs nothing else
     sources = [source.split(",") for source in re.findall(r'src="([^"]*)"', page)]
-    assert [kind for kind, _ in sources] == ["data:image/png;base64"] * 5
+    assert [kind for kind, _ in sources] == ["data:image/png;base64"] * 4
     assert all(base64.b64decode(content).startswith(b"\x89PNG") for _, content in sources)
     assert not re.search(r"https?://|<script|<link", page)
     assert "<td class=n>30.00" in page
     latex = (whole / "paper.tex").read_text()
     escaped = r"2026-11-25, a\_b\textasciicircum{}c: $-$2.5 \& \$$\pm$"
     assert latex_text("2026-11-25, a_b^c: -2.5 & $±") == escaped
-    assert r"Ours (80$^{3}$) & published" in latex
+    assert r"Ours (80$^{3}$) & PC & published" in latex
     assert "textasciicircum" not in latex
-    assert r"\caption{D-NeRF, mean of eight scenes (table 1 of the paper)}" in latex
+    assert r"\caption{D-NeRF, mean of eight scenes (table 1 of the paper). Type: N without" in latex
     for name in ("table", "tabular", "document"):
         assert latex.count(rf"\begin{{{name}}}") == latex.count(rf"\end{{{name}}}") > 0
     assert r"\footnotesize machine: a cpu, 2 threads, torch 2" in latex
@@ -215,9 +216,9 @@ def test_wide_tables_are_cut_for_latex(tmp_path):
     write_paper(tmp_path, tmp_path / "out")
     latex = (tmp_path / "out" / "paper.tex").read_text()
     heads = re.findall(r"\\toprule\n(.*)", latex)
-    assert [head.count("&") for head in heads] == [10, 13, 13, 13]
+    assert [head.count("&") for head in heads] == [11, 14, 14, 14]
     assert latex.count(r"(supplement of table 1 of the paper), part") == 3
-    assert all(head.startswith("method & kind & ") for head in heads)
+    assert all(head.startswith("method & type & kind & ") for head in heads)
     assert r"\shortstack[r]{Hell Warrior\\PSNR$\uparrow$}" in heads[1]
     marked = Table(["a", "x", "y", "z"], [["r", 1, 2, 3]], marks={(0, 3): "best"}).cut(2)[1]
     assert marked.texts("md") == [["r", "**3.00**"]]
@@ -257,8 +258,8 @@ def test_a_column_that_names_no_kind_of_view_has_its_kind_in_the_protocol(tmp_pa
     paper_run(tmp_path, "lift", dataset="lego_complete", made=True, **both)  # whose columns name theirs
     write_paper(tmp_path, tmp_path / "out")
     text = re.sub(" +", " ", (tmp_path / "out" / "paper.md").read_text())
-    assert f"| {OURS} | 22.00 |" in text
-    assert f"| {OURS}, 2 test views | 20.00 |" in text
+    assert f"| {OURS} | PC | 22.00 |" in text
+    assert f"| {OURS}, 2 test views | PC | 20.00 |" in text
     of_kinds = re.findall(r"\* protocol \d: (\w+),.* scores of test views (.*)", text)
     assert of_kinds == [("dnerf", "between training times"), ("dnerf", "at training times")]
 
@@ -278,9 +279,9 @@ def test_counterparts_never_meet_printed_numbers(tmp_path):
     runs, _ = read_runs(tmp_path)
     made = stand_in(read_paper(PAPER)["dnerf"], runs)
     names = [column.name for column in made.columns]
-    assert names[1:4] == ["vehicle PSNR↑", "vehicle SSIM↑", "training, s a run"]  # nothing has LPIPS
+    assert names[1:5] == ["type", "vehicle PSNR↑", "vehicle SSIM↑", "training, s a run"]  # nothing has LPIPS
     assert names[-2:] == ["published as", "published: Mean of 8 PSNR"]
-    assert made.texts()[0][1] == "28.00"
+    assert made.texts()[0][1:3] == ["PC", "28.00"]
     assert made.rows[0][-2:] == ["Ours (80^3)", "32.68"]
     assert stand_in(read_paper(PAPER)["dnerf_scenes"], runs) is None
     paper_run(tmp_path / "two", "vehicle", "full", made=True)
@@ -313,7 +314,7 @@ def test_every_system_stands_beside_its_published_row(tmp_path, dataset):
         paper_run(tmp_path / "made", "toy", dataset=dataset, warp=model, made=True, **scores)
     rows = table_of(tmp_path / "real", dataset).rows
     for row in (row for row in table.rows if row.variant in (None, "full")):
-        at = next(i for i, line in enumerate(rows) if line[:2] == [row.name, "published"])
+        at = next(i for i, line in enumerate(rows) if [line[0], line[2]] == [row.name, "published"])
         assert rows[at + 1][0].startswith(f"forewarp: {row.model}")
     at_the_end = [row[0].split(",")[0].split(": ")[1] for row in rows[-len(models - SYSTEMS[dataset]) :]]
     assert set(at_the_end) == models - SYSTEMS[dataset]
@@ -340,7 +341,7 @@ def test_rows_of_other_views_or_another_clock_stand_apart(tmp_path):
     new = paper_run(tmp_path / "3", "toy", made=True, protocol={"clock": "processor"}, psnr=20.0)
     write_paper(tmp_path, tmp_path / "out")
     text = re.sub(" +", " ", (tmp_path / "out" / "paper.md").read_text())
-    assert f"| {OURS} of processor time | 20.00 |" in text
+    assert f"| {OURS} of processor time | PC | 20.00 |" in text
     assert "fast, 1 min a run by the processor clock" in text
     assert f"* {old.relative_to(tmp_path)}: another run of the same is newer" in text
     assert str(new) not in text
@@ -522,3 +523,99 @@ def test_kinds_of_test_views_and_scenes_have_sections_of_their_own(tmp_path):
         match="expected runs of ablation=full, .*, but got none among 1 .*; make some with make ab",
     ):
         write_ablation(write_run(tmp_path / "other").parent, tmp_path / "out")
+
+
+@pytest.mark.parametrize("model", [*options("model"), "theirs"])
+def test_every_method_has_the_papers_type(model):
+    types = {
+        "N": {"nerf", "tnerf"},
+        "PC": {"dnerf", "ndvg", "forward", "backward"},
+        "–": {"particles", "theirs"},
+    }
+    types["NPC"] = {"neural_volumes", "nerfies", "hypernerf", "tineuvox_s", "tineuvox_b"}
+    tables = read_paper(PAPER)
+    (expected,) = (name for name, methods in types.items() if model in methods)
+    assert tables["dnerf"].type_of(model) == [expected]
+    assert tables["modules"].type_of(model) == []  # as in the paper, whose rows are all its own method
+
+
+def test_a_type_stands_behind_each_method_and_is_explained(tmp_path):
+    for model in ("forward", "nerfies", "particles"):
+        paper_run(tmp_path, "hook", warp=model)
+    table = table_of(tmp_path, "dnerf_scenes")
+    found = {row[0]: row[1] for row in table.rows if row[0]}
+    own = {"forward (the paper's method)": "PC", "nerfies": "NPC", "particles": "–"}
+    expected = {"T-NeRF": "N", "TiNeuVox-S (100^3)": "NPC", "NDVG": "PC"}
+    expected |= {f"forewarp: {name}": kind for name, kind in own.items()}
+    assert {name: found[name] for name in expected} == expected
+    assert table.caption.startswith("Type: N without a canonical space, PC with a physical one")
+
+
+def sheet(colour, folder, views, kind="sheets"):
+    """Sheets of a white truth with a dot, and a picture of one colour."""
+    truth = np.full((9, 12, 3), 255, np.uint8)
+    truth[4, 6] = 0
+    white, picture = np.full((9, 4, 3), 255, np.uint8), np.full((9, 12, 3), colour, np.uint8)
+    for view in views:
+        file = folder / "images" / kind / f"{view}.png"
+        file.parent.mkdir(parents=True, exist_ok=True)
+        iio.imwrite(file, np.concatenate([truth, white, picture, white, picture], 1))
+
+
+@pytest.fixture
+def illustrated(tmp_path):
+    """A folder with every kind of figure, and what was written."""
+    runs, views = tmp_path / "runs", {"test/a": (0.5, 30.0)}
+    of_scene = {"both": ("vrig-chicken", "hypernerf"), "lift": ("lift", "lego_complete")}
+    for colour, (variant, model, where) in enumerate(
+        [(None, "forward", "both"), (None, "tineuvox_s", "both"), (None, "dnerf", "lift")]
+        + [("full", "forward", "lift"), ("no_inpainter", "forward", "lift")]
+        + [(f"resolution [[0, {side**3}]]", "forward", "both") for side in (20, 40)]
+    ):
+        scene, dataset = of_scene[where]
+        scores = {"space": {"psnr": 20.0}} if where == "lift" else {"psnr": 20.0 + colour}
+        folder = paper_run(runs, scene, variant, dataset=dataset, warp=model, **scores)
+        write_views(folder, views)
+        sheet(30 * colour, folder, views)
+        sheet(30 * colour, folder, views, "depth")
+    steps = [{"does": "input", "from": [], "shape": [2, 8, 8, 8], "parameters": 0}]
+    steps.append(
+        {"does": "conv3d", "from": [0], "shape": [3, 8, 8, 8], "kernel": [3, 3, 3], "parameters": 165}
+    )
+    (folder / "networks.json").write_text(json.dumps({"inpainter": steps}))
+    return tmp_path / "out", write_paper(runs, tmp_path / "out")
+
+
+def test_every_figure_stands_on_each_page_with_a_caption(illustrated):
+    out, files = illustrated
+    scenes = ("views-hypernerf-vrig-chicken", "views-lego_complete-lift", "ablation-lift", "inpainter")
+    names = {*scenes, "resolution", "resolution-vrig-chicken-forward-fast-1-min"}
+    assert {path.stem.removeprefix("paper-") for path in files if path.suffix == ".png"} == names
+    text, latex, page = ((out / f"paper.{kind}").read_text() for kind in ("md", "tex", "html"))
+    for name in names:
+        assert f"![paper-{name}](paper-{name}.png)" in text
+        assert f"{{paper-{name}.png}}" in latex
+        assert f'alt="paper-{name}"' in page
+    assert latex.count(r"\begin{figure}") == latex.count(r"\label{fig:paper-") == len(names)
+    caption = "Read off the module of forward, preset fast: 165 parameters."
+    assert all(caption in whole for whole in (text, latex, page))
+    assert r"\caption{Test view by resolution: vrig-chicken. The test view nearest to the middle" in latex
+
+
+def test_a_broken_description_of_a_network_is_named(tmp_path):
+    folder = paper_run(tmp_path, "hook")
+    (folder / "networks.json").write_text('{"inpainter": [{"does": "conv3d"}]}')
+    with pytest.raises(ValueError, match="networks.json: expected steps of networks, but got no key"):
+        write_paper(tmp_path, tmp_path / "out")
+
+
+@pytest.mark.slow
+def test_the_latex_page_compiles_without_overfull_boxes(illustrated):
+    if shutil.which("pdflatex") is None:
+        pytest.skip("pdflatex is not installed (texlive-latex-recommended)")
+    words = ["pdflatex", "-interaction=nonstopmode", "-halt-on-error", "paper.tex"]
+    done = subprocess.run(words, cwd=illustrated[0], capture_output=True, text=True, errors="replace")
+    assert done.returncode == 0, done.stdout[-2000:]
+    for fault in ("Overfull", "Missing character", "undefined", "multiply defined"):
+        assert fault not in done.stdout
+    assert (illustrated[0] / "paper.pdf").read_bytes().startswith(b"%PDF")

@@ -58,6 +58,7 @@ KEYS = shlex.split("data scenes methods model preset minutes steps seeds sweeps 
 KEYS = dict.fromkeys([*KEYS, "launcher", "more", "small"], "") | {"jobs": "2", "device": "gpu"}
 TABLES = ["dnerf", "hypernerf", "nhr", "lego_complete"]
 ABLATIONS = ["ablation_modules", "ablation_losses"]
+OF_FORWARD = [*ABLATIONS, "resolution"]
 # Sweeps and the counterparts they run on without data, in two lanes of about the same length, a core each.
 LANES = (
     "methods:dnerf nhr:nhr ablation_losses:dnerf ablation_modules:dnerf",
@@ -71,8 +72,15 @@ OF_ABLATIONS = shlex.split(
     "callbacks.pictures=null logger=none paths.runs=runs/ablations"
 )
 ROOM = ["stage.coarse.background_num_voxels=[[0,27000]]", "stage.fine.background_num_voxels=[[0,110592]]"]
-# With small=1, beside Job.small; gpu has a tiny model, too.
-SMALL = shlex.split("sheets=0 logger=none callbacks.pictures=null")
+# With small=1, beside Job.small; gpu has a tiny model, and tables have scenes as small as metrics allow.
+SMALL = shlex.split("sheets=1 logger=none callbacks.pictures=null")
+FEW = {
+    "dnerf": "data.synthesis.size=64 data.synthesis.frames=16 data.synthesis.test_views=[2,2,2]",
+    "hypernerf": "data.synthesis.frames=9",
+    "nhr": "data.synthesis.size=96 data.synthesis.frames=6",
+    "lego_complete": "data.synthesis.size=64 data.synthesis.frames=8 data.synthesis.motions=[lift_tilt] "
+    "data.synthesis.test_views=[1,2,4]",
+}
 TINY = shlex.split(
     "data.scene=tiny paths.data=runs/bench-gpu data.synthesis.size=32 data.synthesis.frames=8 "
     "data.synthesis.test_views=[1,1,1] preset.rays=64 preset.inpainter_width=16 data.held_out=2 "
@@ -162,7 +170,8 @@ def _made_small(job: Job) -> Job:
 
     def apart(command: list[str]) -> list[str]:
         moved = [word.replace("out=docs/", "out=runs/").replace("runs/", "runs/small/") for word in command]
-        return moved if moved != command else [*moved, "paths.runs=runs/small"]
+        named = any(word.startswith(("run=", "runs=", "paths.runs=", "out=")) for word in moved)
+        return moved if named else [*moved, "paths.runs=runs/small"]
 
     job.lanes = [[shortened(sweep) for sweep in lane] for lane in job.lanes]
     job.then = [apart(command) for command in job.then]
@@ -211,9 +220,10 @@ def tables(keys: Keys) -> Job:
     out = keys.out or "runs/paper/results"
     then = [["report", "kind=paper", "runs=runs/paper", f"out={out}", "curves=docs/results"]]
     if not keys.data:
-        return Job(_counterparts(keys.sweeps, base, keys), then, int(keys.jobs))
+        sweeps = keys.sweeps or ("all" if keys.small else "")
+        return Job(_counterparts(sweeps, base, keys), then, int(keys.jobs))
     if sweeps == ["all"]:
-        sweeps = [*TABLES, *ABLATIONS, "resolution"]
+        sweeps = [*TABLES, *OF_FORWARD]
     sweeps = [name for sweep in sweeps for name in (ABLATIONS if sweep == "ablations" else [sweep])]
     base += [*keys.chosen(*scenes), "absent=refuse"] if scenes else [f"paths.scenes={keys.data}"]
     return Job([[[*base, f"sweeps={sweep}", *_models(keys.methods, sweep)] for sweep in sweeps]], then)
@@ -225,7 +235,7 @@ def _until(minutes: str | None = None, steps: str | None = None) -> Sweep:
 
 def _models(methods: str, sweep: str) -> Sweep:
     """Return the override that names methods in place of a sweep's own, where a sweep is of any method."""
-    if not methods or sweep in (*ABLATIONS, "resolution"):
+    if not methods or sweep in OF_FORWARD:
         return []
     if methods == "all":
         content = yaml.safe_load((project_root() / "sweeps" / "methods.yaml").read_text())
@@ -234,13 +244,19 @@ def _models(methods: str, sweep: str) -> Sweep:
 
 
 def _counterparts(sweeps: str, base: Sweep, keys: Keys) -> list[list[Sweep]]:
-    """Return the sweeps of counterparts in two lanes: the tables', those of ``ablations``, or ``all``."""
-    left_out = {"": [*ABLATIONS, "resolution"], "ablations": [*TABLES, "methods", "resolution"], "all": []}
+    """Return the sweeps of counterparts in two lanes: the tables', those of ``ablations``, or ``all``, which
+    together draw every figure.
+    """
+    left_out = {"": OF_FORWARD, "ablations": [*TABLES, "methods", "resolution"], "all": []}
     base = [*base, "budget.clock=processor", "threads=1"]
 
     def of_pair(sweep: str, data: str) -> Sweep:
-        room = ROOM if sweeps == "ablations" and data == "hypernerf" else []
-        return [*base, f"sweeps={sweep}", f"scene=counterpart_{data}", *_models(keys.methods, sweep), *room]
+        more = _models(keys.methods, sweep)
+        if data == "hypernerf" and (sweeps == "ablations" or (keys.small and sweep in OF_FORWARD)):
+            more += ROOM
+        if keys.small and sweeps == "all":
+            more += [*shlex.split(FEW[data]), "paths.data=runs/data", "callbacks.accuracy=null"]
+        return [*base, f"sweeps={sweep}", f"scene=counterpart_{data}", *more]
 
     lanes = [[pair.split(":") for pair in lane.split()] for lane in LANES]
     return [[of_pair(*pair) for pair in lane if pair[0] not in left_out[sweeps]] for lane in lanes]

@@ -46,23 +46,33 @@ def hues(turns: Tensor) -> Tensor:
     return 0.5 + 0.45 * torch.cos(2 * math.pi * (turns[..., None] - thirds))
 
 
-def depth_colors(depth: Tensor, opacity: Tensor) -> Tensor:
+def depth_colors(depth: Tensor, opacity: Tensor, ends: tuple[float, float] | None = None) -> Tensor:
     """Draw depth (H, W) over white, near bright, with its scale in the lower right corner, in world units.
 
-    The scale spans opaque pixels but 1 % at either end. A small image has none.
+    The scale spans ``ends``; None: those of ``depth_ends``. A small image has none.
     """
-    solid = depth[opacity > 0.5]
-    if not len(solid):
+    ends = ends or depth_ends(depth, opacity)
+    if ends is None:
         return depth.new_ones(*depth.shape, 3)
-    near, far = torch.quantile(solid[:: max(1, len(solid) // 100_000)], depth.new_tensor([0.01, 0.99]))
-    span = torch.maximum(far - near, 1e-6 * far).clamp(min=torch.finfo(depth.dtype).tiny)
-    colors = ramp((far - depth) / span, _DEPTH)
+    near, far = ends
+    colors = ramp((far - depth) / max(far - near, 1e-6 * far, torch.finfo(depth.dtype).tiny), _DEPTH)
     colors = torch.lerp(torch.ones_like(colors), colors, opacity[..., None].clamp(0, 1))
-    scale = at_least(depth_scale(float(near), float(far)), _LINE * max(2, min(depth.shape) // 100)).to(colors)
+    scale = at_least(depth_scale(near, far), _LINE * max(2, min(depth.shape) // 100)).to(colors)
     height, width = scale.shape[:2]
     if height < depth.shape[0] and width < depth.shape[1]:
         colors[-height:, -width:] = scale
     return colors
+
+
+def depth_ends(depth: Tensor, opacity: Tensor) -> tuple[float, float] | None:
+    """Return the nearest and the farthest depth of opaque pixels, but for 1 % at either end; None if there
+    are none.
+    """
+    solid = depth[opacity > 0.5]
+    if not len(solid):
+        return None
+    ends = torch.quantile(solid[:: max(1, len(solid) // 100_000)], depth.new_tensor([0.01, 0.99]))
+    return tuple(ends.tolist())
 
 
 def depth_scale(near: float, far: float) -> Tensor:

@@ -17,7 +17,7 @@ from rich.table import Table
 from torch import Tensor
 
 from forewarp.clock import now
-from forewarp.drawing.images import at_least, error_colors, in_a_row, write_png
+from forewarp.drawing.images import at_least, depth_colors, depth_ends, error_colors, in_a_row, write_png
 from forewarp.files import write_json
 from forewarp.methods.effect import switched
 from forewarp.methods.method import CarriesPixels, HasEllipsoids, HasLayers, HasTrajectories, parameter_count
@@ -99,7 +99,8 @@ def evaluate(
     """Measure a fitted scene on its test views; all numbers but the seconds are reproducible.
 
     Write ``images/<name>.png`` (the best rendering), for some views ``images/sheets/<name>.png`` (truth |
-    prediction | error), ``per_image.json``, and last ``metrics.json``.
+    prediction | error) and the same of depth, ``images/depth/<name>.png``, where it is known,
+    ``per_image.json``, ``networks.json`` if the method has any to draw, and last ``metrics.json``.
 
     Args:
         module: the fitted scene, on the device to use.
@@ -136,7 +137,9 @@ def evaluate(
         if progress is not None:
             progress(len(rows), len(chosen))
     for number, frame in enumerate(targets.frames):  # images of an earlier choice of views
-        for is_written, place in ((number in rows, images), (number in on_sheets, images / "sheets")):
+        shown = number in on_sheets
+        for is_written, place in ((number in rows, ""), (shown, "sheets"), (shown, "depth")):
+            place = images / place
             if not is_written:
                 (place / f"{frame.name}.png").unlink(missing_ok=True)
     per_image = [rows[number] for number in sorted(rows)]
@@ -170,6 +173,8 @@ def evaluate(
         if (found := of_motion(module, scene)) is not None:
             metrics[name] = found
     write_json(folder / "per_image.json", {"images": per_image})
+    if networks := module.method.outlines():
+        write_json(folder / "networks.json", networks)
     write_json(folder / "metrics.json", metrics)
     return metrics
 
@@ -336,11 +341,26 @@ def _score(view: RenderedView, suite: ImageSuite) -> dict:
 
 
 def _save(view: RenderedView, folder: Path, is_on_sheet: bool) -> None:
-    truth, image = view.target.rgb, _image(list(view.renderings.values())[-1], view.target)
-    write_png(folder / f"{view.target.frame.name}.png", image)
+    best, target = list(view.renderings.values())[-1], view.target
+    name, truth, image = f"{target.frame.name}.png", target.rgb, _image(best, target)
+    write_png(folder / name, image)
     if is_on_sheet:
-        sheet = in_a_row([at_least(i, _SHEET_SIDE) for i in (truth, image, error_colors(truth, image))])
-        write_png(folder / "sheets" / f"{view.target.frame.name}.png", sheet)
+        parts = {"sheets": (truth, image, error_colors(truth, image))}
+        parts |= {"depth": _depth_parts(best, target)} if target.depth is not None else {}
+        for place, of_place in parts.items():
+            write_png(folder / place / name, in_a_row([at_least(part, _SHEET_SIDE) for part in of_place]))
+
+
+def _depth_parts(rendering: Rendering, target: Target) -> list[Tensor]:
+    """Draw true depth, rendered depth in the same colours, and by what factor they differ: white is 1.25."""
+    true = target.depth
+    depth, opacity = (x.reshape(true.shape).cpu() for x in (rendering.depth, rendering.opacity))
+    solid = (true > 0).to(true)
+    ends = depth_ends(true, solid) or (0.0, 0.0)
+    ratio = torch.maximum(depth / true, true / depth.clamp(min=1e-6 * ends[1]))
+    over = torch.where(true > 0, ratio - 1, 0.0)[..., None]
+    drawn = [depth_colors(true, solid, ends), depth_colors(depth, opacity, ends)]
+    return [*drawn, error_colors(over, torch.zeros_like(over))]
 
 
 def show(metrics: dict, folder: Path, absent: dict[str, str]) -> None:

@@ -179,6 +179,10 @@ class Method(nn.Module):
         about = {"departures": self.departures(), "faults": self.faults()}
         return {name: "; ".join(notes) for name, notes in about.items() if notes}
 
+    def outlines(self) -> dict[str, list[dict]]:
+        """Return by name the steps of networks that pages draw, as ``ops.outline`` lists them."""
+        return {}
+
     @property
     def size(self) -> tuple[str, int]:
         """What the cost grows with, and how many there are: voxels, particles, parameters."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from itertools import product
 from pathlib import Path
 
@@ -18,6 +18,16 @@ COLORS = ("#1b6ca8", "#d1495b", "#2e8b57", "#d98200", "#6a4c93", "#333333")
 DASHES = ("-", (0, (4, 1.5)), (0, (1, 1)))
 LEADER = {"arrowstyle": "-", "linewidth": 0.6, "alpha": 0.6, "relpos": (0, 0.5), "shrinkA": 2, "shrinkB": 1}
 DOTS, TITLE, WIDEST, MARGIN = 120, 26, 1500, 24  # pixels: an inch, a title, the picture, around the subject
+ACROSS = 7  # most test views beside each other
+DETAIL = 0.3  # of a picture's shorter side: the width of what is enlarged
+STEPS = {
+    "batch_norm": "norm",
+    "conv3d": "convolution",
+    "linear": "convolution",
+    "relu": "ReLU",
+    "cat": "joining",
+}
+STEPS |= {"max_pool3d": "max pooling", "interpolate": "interpolation"}  # of networks, in words
 
 
 def figure_of(rows: int, columns: int, size: tuple[float, float], heights: Sequence[float] | None = None):
@@ -216,9 +226,9 @@ def spread_out(places: Sequence[float], gap: float) -> list[float]:
     return found
 
 
-def sheets_of(folder: Path) -> dict[str, Path]:
-    """Return the sheets truth | rendering | error of a run: name of the view -> file."""
-    sheets = Path(folder) / "images" / "sheets"
+def sheets_of(folder: Path, kind: str = "sheets") -> dict[str, Path]:
+    """Return the sheets truth | rendering | error of a run, or its ``depth``: name of the view -> file."""
+    sheets = Path(folder) / "images" / kind
     return {path.relative_to(sheets).with_suffix("").as_posix(): path for path in sheets.rglob("[!.]*.png")}
 
 
@@ -228,9 +238,9 @@ def thirds(sheet):
     return [sheet[:, i * (width + GAP) : i * (width + GAP) + width] for i in range(3)]
 
 
-def _parts(row: Row, view: str) -> list[np.ndarray]:
-    """Read truth, rendering and error of a view of a run."""
-    with Image.open(sheets_of(row["folder"])[view]) as sheet:
+def _parts(row: Row, view: str, kind: str = "sheets") -> list[np.ndarray]:
+    """Read truth, rendering and error of a view of a run, or of its ``depth``."""
+    with Image.open(sheets_of(row["folder"], kind)[view]) as sheet:
         return thirds(np.asarray(sheet) / 255)
 
 
@@ -274,31 +284,206 @@ def draw_beside(path: Path, runs: Mapping[str, Row], near: float, about: str) ->
     return save(figure, path)
 
 
-def draw_sheet(path: Path, runs: Mapping[str, Row]) -> Path | None:
-    """Draw a row for each scene: truth, result and error of a view; None if no run has a sheet."""
-    found = {scene: sheets for scene in sorted(runs) if (sheets := sheets_of(runs[scene]["folder"]))}
-    if not found:
+def draw_details(
+    path: Path, runs: Mapping[str, Row], near: float = 0.5, *, depth: bool = False
+) -> Path | None:
+    """Draw a test view by all runs, cut to the subject, and enlarged below it what is in its box,
+    chosen by ``telling``; at last the view's PSNR.
+
+    Args:
+        path: file of the picture.
+        runs: label -> row of the run; runs without sheets are left out.
+        near: time near which the view is chosen, as by ``view_near``.
+        depth: show the depth, too, where all runs have it.
+
+    Return None if the runs share no view with a sheet.
+    """
+    runs = {name: row for name, row in runs.items() if sheets_of(row["folder"])}
+    if (view := view_near(runs, near)) is None:
         return None
-    figure, axes = figure_of(len(found), 3, (9, 3.2 * len(found)))
-    for row, (scene, sheets) in zip(axes, found.items()):
-        name = sorted(sheets)[len(sheets) // 2]
-        _show(row, dict(zip((f"{scene}, {name}", "rendered", "error"), _parts(runs[scene], name))))
-    return save(figure, path)
+    parts = {name: _parts(row, view) for name, row in runs.items()}
+    depth = depth and all(view in sheets_of(row["folder"], "depth") for row in runs.values())
+    depths = {name: _parts(row, view, "depth") for name, row in runs.items()} if depth else {}
+    first, (truth, *_) = next(iter(parts.items()))
+    cut = subject(truth)
+    shown = {"truth": truth, **{name: drawn for name, (_, drawn, _) in parts.items()}}
+    shown = {name: picture[cut] for name, picture in shown.items()}
+    by_depth = {"truth": depths[first][0]} | {n: of[1] for n, of in depths.items()} if depth else {}
+    height, width = shown["truth"].shape[:2]
+    size = max(2, round(DETAIL * 0.7 * min(height, width))), max(2, round(DETAIL * min(height, width)))
+    errors = [abs(picture - shown["truth"]).mean(-1) for name, picture in shown.items() if name != "truth"]
+    window = telling(np.stack(errors), size)
+    boxed = framed(shown["truth"], window)
+    tiles = {}
+    for name, picture in shown.items():
+        tile = [boxed if name == "truth" else picture, enlarged(picture[window], width)]
+        tile += [by_depth[name][cut]] if depth else []
+        white = np.ones((GAP, width, 3))
+        tiles[name] = np.concatenate([row for part in tile for row in (white, part)][1:])
+    times = {image["name"]: image["time"] for image in runs[first]["images"]}
+    below = {"truth": view + (f", time {times[view]:.2f}" if view in times else "")}
+    for name, row in runs.items():
+        psnr = [image["scores"]["psnr"] for image in row["images"] if image["name"] == view]
+        below[name] = f"{psnr[0]:.2f} dB" if psnr else ""
+    across = min(len(tiles), ACROSS)
+    down, wide = -(-len(tiles) // across), WIDEST / across / DOTS
+    high = wide * next(iter(tiles.values())).shape[0] / width + 2 * TITLE / DOTS
+    figure, axes = figure_of(down, across, (across * wide, down * high))
+    figure.get_layout_engine().set(w_pad=0.02, h_pad=0.02, wspace=0, hspace=0)
+    for axis in axes.flat[len(tiles) :]:
+        axis.set_axis_off()
+    for axis, (name, tile) in zip(axes.flat, tiles.items()):
+        axis.imshow(tile, interpolation="antialiased")
+        axis.set_title(name, fontsize="medium")
+        axis.set_xlabel(below[name], fontsize="medium", labelpad=3)
+        axis.set(xticks=[], yticks=[])
+        axis.spines[:].set_visible(False)
+    return save(figure, path, colors=256)
 
 
-def draw_resolution(path: Path, rows: Sequence[Row]) -> Path | None:
-    """Draw PSNR against voxels along a side for runs of ``sweeps=resolution``, one line per scene.
+def telling(errors: np.ndarray, size: tuple[int, int]) -> tuple[slice, slice]:
+    """Choose the window where runs differ most: whose sum of the standard deviation, over the runs, of their
+    errors is largest; of one run, or equal ones, where the error is.
 
-    Return None if no scene has two sizes.
+    Args:
+        errors: (runs, H, W).
+        size: rows and columns of the window.
+
+    Returns:
+        its rows and its columns.
+    """
+    spread = errors.std(0)
+    spread = spread if spread.max() > 1e-6 else errors.mean(0)
+    rows, columns = (min(side, most) for side, most in zip(size, spread.shape))
+    sums = np.pad(spread, ((1, 0), (1, 0))).cumsum(0).cumsum(1)
+    of_window = (
+        sums[rows:, columns:] - sums[:-rows, columns:] - sums[rows:, :-columns] + sums[:-rows, :-columns]
+    )
+    row, column = np.unravel_index(of_window.argmax(), of_window.shape)
+    return slice(int(row), int(row) + rows), slice(int(column), int(column) + columns)
+
+
+def framed(picture: np.ndarray, window: tuple[slice, slice], wide: int = 2) -> np.ndarray:
+    """Draw a red line ``wide`` pixels wide along the inside of a window of a picture (H, W, 3)."""
+    boxed, inner = picture.copy(), tuple(slice(side.start + wide, side.stop - wide) for side in window)
+    boxed[window] = (0.82, 0.1, 0.15)
+    boxed[inner] = picture[inner]
+    return boxed
+
+
+def enlarged(picture: np.ndarray, width: int) -> np.ndarray:
+    """Repeat the pixels of a picture (H, W, 3) so that it becomes ``width`` wide."""
+    old_height, old_width = picture.shape[:2]
+    height = round(old_height * width / old_width)
+    return picture[np.arange(height) * old_height // height][:, np.arange(width) * old_width // width]
+
+
+def draw_network(path: Path, steps: Sequence[Mapping]) -> Path:
+    """Draw a network from the list of its steps that a run's ``networks.json`` has (see ``ops.outline``).
+
+    A box is a volume, the lower the smaller, and as wide as it has channels (the number above). An arrow is
+    one or several steps, a dashed one goes to where volumes are joined. N voxels along a side are given.
+
+    Args:
+        path: file of the picture.
+        steps: in their order.
+    """
+    from matplotlib.patches import Rectangle
+
+    groups = grouped_steps(steps)
+    volumes = [steps[group[-1]]["shape"] for group in groups]
+    levels = [round(np.log2(volumes[0][1] / side)) for _, side, *_ in volumes]
+    deep, top, most = max(levels), min(levels), max(channels for channels, *_ in volumes)
+    of_step = {number: place for place, group in enumerate(groups) for number in group}
+    names = [arrow_name(steps, group) for group in groups]
+    styles = dict(zip(dict.fromkeys(names[1:]), COLORS * len(names)))
+    lefts, rights = [], []
+    for place, (channels, *_) in enumerate(volumes):
+        changed = place and levels[place] != levels[place - 1]
+        lefts.append(rights[-1] + (0.55 if changed else 0.75) if place else 0.0)
+        rights.append(lefts[-1] + 0.1 + 0.5 * channels / most)
+    figure, ((axis,),) = figure_of(1, 1, (12.5, 1.1 + deep - top + 1))
+    for place, (channels, *_) in enumerate(volumes):
+        left, right, middle = lefts[place], rights[place], -levels[place]
+        about = {"facecolor": "#dbe7f1", "edgecolor": COLORS[0], "linewidth": 1}
+        axis.add_patch(Rectangle((left, middle - 0.3), right - left, 0.6, **about))
+        axis.text((left + right) / 2, middle + 0.34, channels, ha="center", va="bottom", fontsize=8)
+        for source in (of_step[number] for number in steps[groups[place][0]]["from"]):
+            color, shift, line = styles[names[place]], 0.0, {"linewidth": 1.4}
+            if source < place - 1:
+                color, shift, line = "0.55", 0.2, {"linewidth": 1, "linestyle": "--"}
+            elif levels[place] != levels[source]:
+                shift = 0.15 if levels[place] > levels[source] else -0.15
+            down = shift if source == place - 1 else -shift  # a skip stays at its height
+            begin, end = (rights[source], -levels[source] - down), (left, middle + shift)
+            about = {"arrowstyle": "-|>", "color": color, "shrinkA": 0}
+            axis.annotate("", end, begin, arrowprops=about | line)
+    for level in range(top, deep + 1):
+        axis.text(-0.35, -level, _sides(level), ha="right", va="center", fontsize=9)
+    for name, color in styles.items():
+        axis.plot([], [], color=color, linewidth=2, label=name)
+    if any(len(step["from"]) > 1 for step in steps):
+        axis.plot([], [], color="0.55", linestyle="--", label="to what it is joined with")
+    axis.set(xlim=(-1.1, rights[-1] + 0.1), ylim=(-deep - 0.4, -top + 0.6))
+    axis.set_axis_off()
+    figure.legend(loc="outside lower center", ncols=3, fontsize=8, frameon=False)
+    return save(figure, path, colors=64)
+
+
+def _sides(level: int) -> str:
+    return "N³" if level == 0 else f"(N/{2**level})³" if level > 0 else f"({2**-level}N)³"
+
+
+def grouped_steps(steps: Sequence[Mapping]) -> list[list[int]]:
+    """Gather steps that one arrow stands for: a norm, the layer behind it and its activation.
+
+    >>> of = "input batch_norm conv3d relu interpolate".split()
+    >>> grouped_steps([{"does": does, "from": [i - 1]} for i, does in enumerate(of)])
+    [[0], [1, 2, 3], [4]]
+    """
+    groups: list[list[int]] = []
+    for number, step in enumerate(steps):
+        before = groups[-1] if groups and step["from"] == [number - 1] else None
+        last = steps[number - 1]["does"] if number else ""
+        if before is not None and (last == "batch_norm" or step["does"] == "relu"):
+            before.append(number)
+        else:
+            groups.append([number])
+    return groups
+
+
+def arrow_name(steps: Sequence[Mapping], group: Sequence[int]) -> str:
+    """Name the steps of an arrow.
+
+    >>> arrow_name([{"does": "batch_norm"}, {"does": "conv3d", "kernel": [3, 3, 3]}], [0, 1])
+    'norm, convolution 3×3×3'
+    """
+    words = []
+    for number in group:
+        step = steps[number]
+        kernel = "×".join(map(str, step.get("kernel", ())))
+        words.append(f"{STEPS.get(step['does'], step['does'])} {kernel}".strip())
+    return ", ".join(words)
+
+
+def by_side(rows: Iterable[Row]) -> dict[str, dict[int, Runs]]:
+    """Gather runs of ``sweeps=resolution``: scene, method and budget -> voxels along a side -> runs, where
+    there are two sizes.
     """
     runs, lines = Runs(), {}
     for row in (row for row in rows if row["psnr"] is not None):
         voxels = row["config"]["stage"]["fine"]["num_voxels"][-1][1]
         runs.append(row | {"side": round(voxels ** (1 / 3))})
     for key, group in runs.by("scene", "method", "preset", "setting", "minutes", "iterations").items():
-        *names, minutes, iterations = filter(lambda part: part != "", key)
-        label = ", ".join([*names, f"{minutes or iterations:g}"])
-        lines |= {label: group.by("side")} if len(group.by("side")) > 1 else {}
+        *names, minutes, steps = filter(lambda part: part != "", key)
+        budget = [f"{minutes:g} min"] * bool(minutes) + [f"{steps} steps"] * bool(steps)
+        sides = group.by("side")
+        lines |= {", ".join([*names, *budget]): sides} if len(sides) > 1 else {}
+    return lines
+
+
+def draw_resolution(path: Path, lines: Mapping[str, Mapping[int, Runs]]) -> Path | None:
+    """Draw PSNR against voxels along a side, a line for each label of ``by_side``; None if there is none."""
     if not lines:
         return None
     figure, ((axis,),) = figure_of(1, 1, (7, 4.5))

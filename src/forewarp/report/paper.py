@@ -5,6 +5,7 @@ Functions that write search a folder for measured runs, write to ``out``, and re
 
 from __future__ import annotations
 
+import json
 import math
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -17,10 +18,10 @@ from typing import NamedTuple
 import numpy as np
 import yaml
 
-from forewarp.files import MOST_CONFIG, read_text, replace_file
+from forewarp.files import MOST_CONFIG, read_json, read_text, replace_file
 from forewarp.metrics.registry import metric_of
 from forewarp.report import figures
-from forewarp.report.results import KINDS, Point, Row, Runs, nothing
+from forewarp.report.results import KINDS, Point, Row, Runs, nothing, refused
 from forewarp.report.settings import grouped
 from forewarp.report.statistics import INTERVALS, LEAST, Estimate, by_chance, rank, verdict
 from forewarp.report.stored import read_any, stored_csv
@@ -32,8 +33,13 @@ BUDGET = "preset", "minutes", "iterations", "held_out", "train_views", "device",
 BUDGET += ("image_format",)
 ROW = ("ablation", "method", "setting", *BUDGET)
 UNPRINTED = ("particles", "backward")  # methods of this project that the paper prints no row of
-METHODS = ("particles", "forward", "backward")  # that are compared in pictures
+METHODS = ("particles", "forward", "backward")  # that are compared in pictures of the canonical time
 DATASETS = ("dnerf", "hypernerf", "nhr", "lego_complete")
+NO_TYPE = "–"
+TYPES = "Type: N without a canonical space, PC with a physical one (flow is 0 at the canonical time), NPC "
+TYPES += (
+    "with one that need not be physical; – neither (particles: their flow is about 0 at the canonical time)."
+)
 DEPTH = {"depth_delta_1.25": "δ<1.25", "depth_delta_1.5625": "δ<1.25²"}  # printed as percentages
 COSTS = (Column("training, s a run", 0), Column("GiB"), Column("parameters (M)", 3), Column("steps", 0))
 COSTS += (Column("protocol"), Column("device"))  # what a measured row says beside its scores
@@ -72,7 +78,8 @@ class Printed(NamedTuple):
 class PaperTable:
     """One of the paper's tables.
 
-    ``variants``: the measured variants to show; ``means``: more groups to compute, as name -> scenes.
+    ``variants``: the measured variants to show; ``means``: more groups to compute, as name -> scenes;
+    ``types``: of methods, by name.
     """
 
     title: str
@@ -82,6 +89,12 @@ class PaperTable:
     rows: Sequence[Printed]
     notes: Sequence[str]
     means: Mapping[str, tuple[str, ...]]
+    types: Mapping[str, str]
+
+    def type_of(self, method: str | None) -> list[str]:
+        """Return the cells of the column "type", as of the paper: none in a table of one method alone."""
+        several = len({row.model for row in self.rows}) > 1
+        return [self.types.get(method, NO_TYPE)] if self.types and several else []
 
     @property
     def columns(self) -> list[tuple[Group, str]]:
@@ -108,14 +121,15 @@ def read_paper(path: Path) -> dict[str, PaperTable]:
     try:
         # All values as text, so that 30.50 stays as printed.
         content = yaml.load(read_text(Path(path), MOST_CONFIG), Loader=yaml.BaseLoader)
-        return {key: _table(key, entry, content["datasets"]) for key, entry in content["tables"].items()}
+        tables, types = content["tables"].items(), content.get("types") or {}
+        return {key: _table(key, entry, content["datasets"], types) for key, entry in tables}
     except yaml.YAMLError as error:
         raise ValueError(f"{path}: expected YAML, but got {str(error).splitlines()[0]}") from None
     except (KeyError, TypeError, AttributeError) as error:
         raise ValueError(f"{path}: expected tables of groups and rows, but got {error!r}") from None
 
 
-def _table(key: str, entry: dict, datasets: dict) -> PaperTable:
+def _table(key: str, entry: dict, datasets: dict, types: dict) -> PaperTable:
     groups, rows = [], []
     for group in entry["groups"]:
         scenes = tuple(group.get("scenes", datasets[group["dataset"]]))
@@ -131,7 +145,7 @@ def _table(key: str, entry: dict, datasets: dict) -> PaperTable:
         rows.append(Printed(row["name"], values, variant, row.get("model", "forward" if variant else None)))
     means = {name: tuple(scenes) for name, scenes in entry.get("means", {}).items()}
     of_table = entry["title"], entry["source"], entry["variants"], groups, rows
-    return PaperTable(*of_table, entry["notes"], means)
+    return PaperTable(*of_table, entry["notes"], means, types)
 
 
 def measured(table: PaperTable, runs: Runs, variants: Sequence[str] = ()) -> list[Runs]:
@@ -202,23 +216,27 @@ def comparison(table: PaperTable, runs: Runs, numbers: Mapping[str, int] | None 
     datasets = {run["origin"] for of_row in found for run in of_row}
     table = replace(table, groups=[group for group in table.groups if group.dataset in datasets])
     numbers, no_costs = numbers or numbered(runs), [None] * len(COSTS)
+    typed = ["type"] * len(table.type_of(None))
     lines, rules, places = [], [], {}
     for printed in [*table.rows, None]:
         of_method = [of_row for of_row in found if table.printed(of_row[0]) is printed]
-        rules += [len(lines)] if of_method or (printed and lines and lines[-1][1] != "published") else []
+        rules += [len(lines)] if of_method or (printed and lines and "published" not in lines[-1]) else []
         values = [printed.values[column] for column in table.columns] if printed else []
-        lines += [[printed.name, "published", *values, *no_costs]] if printed else []
+        kind = [*table.type_of(printed.model), "published"] if printed else []
+        lines += [[printed.name, *kind, *values, *no_costs]] if printed else []
         for of_row in of_method:
             cells = cells_of(of_row, table)
             places[len(lines)] = of_row
-            lines.append([name_of(of_row, found), "measured", *cells, *costs_of(of_row, numbers)])
+            kind = [*table.type_of(of_row[0]["method"]), "measured"]
+            lines.append([name_of(of_row, found), *kind, *cells, *costs_of(of_row, numbers)])
             if printed and any(cells):
                 both = zip(cells, values)
                 differences = [Difference(cell.mean - float(v)) if cell and v else None for cell, v in both]
-                lines.append(["", "difference to the paper", *differences, *no_costs])
-    columns = ["method", "kind", *(_column(*column) for column in table.columns), *COSTS]
+                lines.append(["", *[""] * len(typed), "difference to the paper", *differences, *no_costs])
+    columns = ["method", *typed, "kind", *(_column(*column) for column in table.columns), *COSTS]
     rules = [rule for rule in rules if rule]
-    return Table(columns, lines, _caption(lines), _marks(places, table, 2), rules)
+    caption = " ".join(filter(None, [TYPES * len(typed), _caption(lines)]))
+    return Table(columns, lines, caption, _marks(places, table, 2 + len(typed)), rules)
 
 
 def stand_in(table: PaperTable, runs: Runs, numbers: Mapping[str, int] | None = None) -> Table | None:
@@ -238,10 +256,14 @@ def stand_in(table: PaperTable, runs: Runs, numbers: Mapping[str, int] | None = 
         printed, own = table.printed(of_row[0]), {run["origin"] for run in of_row}
         values = [printed.values[of, "psnr"] if printed and of.dataset in own else "" for of in shown]
         beside = [printed.name if printed else "", *values]
-        lines.append([name_of(of_row, found), *cells_of(of_row, made), *costs_of(of_row, numbers), *beside])
-    columns = ["measured", *(_column(*column) for column in made.columns), *COSTS, "published as"]
+        first = [name_of(of_row, found), *table.type_of(of_row[0]["method"])]
+        lines.append([*first, *cells_of(of_row, made), *costs_of(of_row, numbers), *beside])
+    typed = ["type"] * len(table.type_of(None))
+    columns = ["measured", *typed, *(_column(*column) for column in made.columns), *COSTS, "published as"]
     columns += [f"published: {group.name} PSNR" for group in shown]
-    return Table(columns, lines, _caption(lines), _marks(dict(enumerate(found)), made, 1)).filled()
+    caption = " ".join(filter(None, [TYPES * len(typed), _caption(lines)]))
+    marks = _marks(dict(enumerate(found)), made, 1 + len(typed))
+    return Table(columns, lines, caption, marks).filled()
 
 
 def counterpart(table: PaperTable, runs: Runs) -> PaperTable | None:
@@ -374,11 +396,12 @@ def write_paper(
         left_out.append(f"no measured row: {', '.join(absent)}")
     for section, file in zip(tables, files):
         replace_file(file, section.tables[0].csv() + "".join(f"# {line}\n" for line in section.facts))
-    drawn = _figures(runs, out, curves)
+    drawn = _figures(paper, runs, out, curves)
     sections = [*tables, *drawn, _about(tables, used, numbers)]
     sections += [Section("Left out", facts=left_out)] if left_out else []
     for kind in ("md", "html", "tex"):
-        replace_file(out / f"paper.{kind}", rendered(f"paper.{kind}.j2", sections=sections, tables=tables))
+        parts = {"sections": sections, "tables": tables, "figures": drawn}
+        replace_file(out / f"paper.{kind}", rendered(f"paper.{kind}.j2", **parts))
     own = [path for section in drawn for path in section.pictures if path.name.startswith("paper-")]
     return [*(out / f"paper.{kind}" for kind in ("md", "html", "tex")), *files, *own]
 
@@ -427,38 +450,125 @@ def budget_of(run: Row, each: str = "", by_processor: str = "") -> list[str]:
     return [run["preset"], *minutes, *([f"{run['iterations']} steps"] if run["iterations"] else [])]
 
 
-def _figures(runs: Runs, out: Path, curves: Path | None) -> list[Section]:
+def _figures(paper: Iterable[PaperTable], runs: Runs, out: Path, curves: Path | None) -> list[Section]:
     """Draw what these runs allow, and add the pictures in ``curves``; say if matplotlib is missing."""
+    runs = Runs(run for run in runs if run["folder"].is_dir())  # rows of a CSV file have no pictures
     plain = runs.where(ablation=None)
     try:
-        sizes = Runs(run for run in runs if str(run["ablation"]).startswith("resolution "))
-        drawn = {"Resolution": figures.draw_resolution(out / "paper-resolution.png", sizes)}
-        for scene, of_scene in plain.by("scene").items():
-            rivals = {}  # the last of several budgets or seeds
-            for same in of_scene.by("seed", *BUDGET).values():
-                known = sorted(same.where(method=METHODS), key=lambda run: METHODS.index(run["method"]))
-                own = {" ".join([run["method"], *run["words"].values()]): run for run in known}
-                rivals = own if len(own) > 1 else rivals
-            if rivals:
-                first = next(iter(rivals.values()))
-                usual = 0.5 if first["origin"] == "hypernerf" else 0.0
-                at = first["metrics"]["protocol"].get("canonical_time", usual)
-                picture, words = out / f"paper-canonical-{scene}.png", f"{scene}, near the canonical time"
-                drawn[f"Canonical comparison: {scene}"] = figures.draw_beside(picture, rivals, at, words)
-        for dataset, method in product(DATASETS, METHODS[:2]):
-            scenes = {run["scene"]: run for run in plain.where(method=method, origin=dataset)}
-            picture = out / f"paper-views-{dataset}-{method}.png"
-            drawn[f"Views: {dataset}, {method}"] = figures.draw_sheet(picture, scenes)
+        found = _views(paper, plain, out), _ablations(paper, runs, out), _resolutions(runs, out)
+        sections = [*_canonical(plain, out), *chain(*found), *_networks(runs, out)]
     except ImportError as error:
         return [Section("Figures", facts=[str(error)])]
-    sections = [Section(title, pictures=[path]) for title, path in drawn.items() if path is not None]
+    sections = [section for section in sections if None not in section.pictures]
     for path in sorted(curves.glob("accuracy-time-*.png")) if curves is not None else ():
         if path.parent.resolve() != out.resolve():
             replace_file(out / path.name, path.read_bytes())
     if pictures := sorted(out.glob("accuracy-time-*.png")):
-        lines = ["separate runs, with views held out: forewarp-report kind=accuracy_time"]
-        sections.append(Section("Accuracy against training time", facts=lines, pictures=pictures))
+        told = "Separate runs, with views held out, of forewarp-report kind=accuracy_time."
+        sections.append(Section("Accuracy against training time", pictures=pictures, caption=told))
     return sections
+
+
+def _rivals(runs: Runs, name: str, order: Iterable[str]) -> dict[str, Row]:
+    """Choose runs of one seed and budget to stand beside each other, where there are most: label -> row. A
+    label is what ``name`` says, and the run's setting.
+
+    Args:
+        runs: of one scene.
+        name: in what they differ.
+        order: of what it says; others come last.
+    """
+    groups = runs.by("seed", *BUDGET).values()
+    most = max(groups, key=lambda same: len(same.by(name, "setting")), default=Runs())
+    places = {value: place for place, value in enumerate(order)}
+    found = {}
+    for run in sorted(most, key=lambda run: places.get(run[name], len(places))):
+        found[" ".join([run[name], *run["words"].values()])] = run
+    return found
+
+
+def _file(out: Path, *words: object) -> Path:
+    """Name a picture; what could not stand in LaTeX or a link becomes a hyphen."""
+    return out / f"paper-{'-'.join(re.sub(r'[^A-Za-z0-9_-]+', '-', str(word)) for word in words)}.png"
+
+
+def _canonical(plain: Runs, out: Path) -> Iterator[Section]:
+    """Draw, of each scene, the test view nearest to the canonical time."""
+    for scene, of_scene in plain.where(method=METHODS).by("scene").items():
+        if len(rivals := _rivals(of_scene, "method", METHODS)) > 1:
+            first = next(iter(rivals.values()))
+            usual = 0.5 if first["origin"] == "hypernerf" else 0.0
+            at = first["metrics"]["protocol"].get("canonical_time", usual)
+            words = f"{scene}, near the canonical time"
+            drawn = figures.draw_beside(_file(out, "canonical", scene), rivals, at, words)
+            caption = "The test view nearest to the canonical time, and the error below it."
+            yield Section(f"Canonical comparison: {scene}", pictures=[drawn], caption=caption)
+
+
+def _views(paper: Iterable[PaperTable], plain: Runs, out: Path) -> Iterator[Section]:
+    """Draw, of each scene, a test view by all methods."""
+    order = dict.fromkeys(chain(["forward"], *(table.types for table in paper)))
+    for dataset, scene in product(DATASETS, plain.by("scene")):
+        if rivals := _rivals(plain.where(origin=dataset, scene=scene), "method", order):
+            drawn = figures.draw_details(_file(out, "views", dataset, scene), rivals)
+            caption = f"{_seen(rivals)} by each method; {_BOXED}."
+            yield Section(f"Test view: {dataset}, {scene}", pictures=[drawn], caption=caption)
+
+
+_BOXED = "below it enlarged what is in the box, where methods differ most; under it the view's PSNR"
+
+
+def _seen(rivals: Mapping[str, Row]) -> str:
+    run = next(iter(rivals.values()))
+    about = ", ".join([*budget_of(run), f"seed {run['seed']}"])
+    return f"The test view nearest to the middle of the time ({about})"
+
+
+def _ablations(paper: Iterable[PaperTable], runs: Runs, out: Path) -> Iterator[Section]:
+    """Draw images and depth by ablation, of the scenes of the table by kind of view (Lego Complete)."""
+    for table in (table for table in paper if any(group.ability for group in table.groups)):
+        names = {row.variant or row.model: row.name.split(" (")[0] for row in [*table.parts, *table.rows]}
+        others = {row.model for row in table.rows if row.variant is None}
+        of_table = runs.where(origin={group.dataset for group in table.groups}, ablation={None, *names})
+        shown = (run for run in of_table if run["ablation"] or run["method"] in others)
+        labelled = Runs(run | {"label": names[run["ablation"] or run["method"]]} for run in shown)
+        for scene, of_scene in labelled.by("scene").items():
+            rivals = _rivals(of_scene, "label", names.values())
+            if sum(run["ablation"] is not None for run in rivals.values()) > 1:
+                drawn = figures.draw_details(_file(out, "ablation", scene), rivals, depth=True)
+                caption = f"{_seen(rivals)} by the whole method and without each part; {_BOXED}; at last the "
+                caption += "depth, in the colours of the true one, if that is known."
+                yield Section(f"Images and depth by ablation: {scene}", pictures=[drawn], caption=caption)
+
+
+def _resolutions(runs: Runs, out: Path) -> Iterator[Section]:
+    """Draw PSNR over voxels along a side, and of each scene a test view by them."""
+    lines = figures.by_side(run for run in runs if str(run["ablation"]).startswith("resolution "))
+    drawn = figures.draw_resolution(_file(out, "resolution"), lines)
+    told = "PSNR by the voxels along a side of the moving grid; bars: as ± in the tables."
+    yield Section("Performance with different resolutions", pictures=[drawn], caption=told)
+    for label, sides in lines.items():
+        sized = Runs(run | {"label": f"{side}³"} for side, of_side in sides.items() for run in of_side)
+        rivals, scene = _rivals(sized, "label", [f"{side}³" for side in sides]), sized[0]["scene"]
+        drawn = figures.draw_details(_file(out, "resolution", *label.split(", ")), rivals)
+        caption = f"{_seen(rivals)} by the number of voxels of the moving grid; {_BOXED}."
+        yield Section(f"Test view by resolution: {scene}", pictures=[drawn], caption=caption)
+
+
+def _networks(runs: Runs, out: Path) -> Iterator[Section]:
+    """Draw each network that runs describe once, whichever runs have it."""
+    known: dict[tuple[str, str], Row] = {}
+    for run in runs:
+        for name, steps in (read_json(run["folder"] / "networks.json") or {}).items():
+            known.setdefault((name, json.dumps(steps)), run)
+    for number, ((name, text), run) in enumerate(known.items(), 1):
+        with refused(f"{run['folder'] / 'networks.json'}: expected steps of networks, but got "):
+            steps = json.loads(text)
+            drawn = figures.draw_network(_file(out, name, *[number] * (number > 1)), steps)
+            count = sum(step["parameters"] for step in steps)
+        caption = f"Read off the module of {run['method']}, preset {run['preset']}: {count:,} parameters. "
+        caption += "A box is a volume, the number above it its channels; N voxels along a side are given."
+        yield Section(f"Network: {name}", pictures=[drawn], caption=caption)
 
 
 def write_ablation(folder: Path, out: Path, published: Path | None = None) -> list[Path]:

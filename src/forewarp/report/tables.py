@@ -29,7 +29,8 @@ MARKS = {
 _LATEX = {c: "\\" + c for c in "&%$#_{}"}
 _LATEX |= {"²": "$^2$", "\\": r"\textbackslash{}", "^": r"\textasciicircum{}"}
 _LATEX |= {"±": r"$\pm$", "δ": r"$\delta$", "<": "$<$", ">": "$>$", "↑": r"$\uparrow$", "↓": r"$\downarrow$"}
-_LATEX |= {"~": r"\textasciitilde{}", "×": r"$\times$"}
+_LATEX |= {"~": r"\textasciitilde{}", "×": r"$\times$", "³": "$^3$", "–": "--", "≥": r"$\geq$", "→": r"$\to$"}
+_LAST = "ſ"  # of the letters that LaTeX's fonts have
 _POWER = re.compile(r"\\textasciicircum\{\}(\d+)")
 _MINUS = re.compile(r"(?<![\w.])-(?=\d)")  # of a number, not of a date or a range
 _BETWEEN = re.compile(r"(?<!\\)\$\$")  # one formula ends where the next begins
@@ -188,13 +189,14 @@ _TAG = re.compile(r"<(?!/?u>)(?=[A-Za-z/!?])")  # a run's names and notes may ho
 
 @dataclass(frozen=True)
 class Section:
-    """A heading with tables and pictures, ``facts`` on how they came about, and footnotes."""
+    """A heading with tables, or pictures and a caption, ``facts`` on how they came about, and footnotes."""
 
     title: str
     tables: Sequence[Table] = ()
     facts: Sequence[str] = ()
     notes: Sequence[str] = ()
     pictures: Sequence[Path] = ()
+    caption: str = ""
 
 
 def rendered(template: str, **values: object) -> str:
@@ -211,6 +213,7 @@ def _environment() -> Environment:
     environment.globals |= {"nets": NETS, "intervals": INTERVALS}
     environment.filters |= {
         "tex": latex_text,
+        "label": lambda text: "-".join(re.findall("[a-z0-9]+", text.lower())),
         "tex_head": _latex_head,
         "tex_rows": lambda table: table.texts("tex", latex_text),
         "inlined": lambda path: "data:image/png;base64," + base64.b64encode(path.read_bytes()).decode(),
@@ -232,5 +235,6 @@ def latex_text(text: str) -> str:
     >>> print(latex_text("50 % of a_b: δ<1.25², -0.4 (80^3)"))
     50 \\% of a\\_b: $\\delta<$1.25$^2$, $-$0.4 (80$^{3}$)
     """
-    escaped = _POWER.sub(r"$^{\1}$", "".join(_LATEX.get(c, c) for c in text))
+    known = (_LATEX.get(c) or (c if c <= _LAST else f"[U+{ord(c):04X}]") for c in text)
+    escaped = _POWER.sub(r"$^{\1}$", "".join(known))
     return _BETWEEN.sub("", _MINUS.sub("$-$", escaped))

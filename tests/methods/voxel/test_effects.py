@@ -1,13 +1,16 @@
 """The effects of the voxel methods, and the dense volumes between them."""
 
 import math
+from collections import Counter
 
 import pytest
 import torch
 
 from forewarp.fields.curves import TrajectoryField
 from forewarp.fields.grids import EMPTY, Activation, RadianceGrid
+from forewarp.methods.method import parameter_count
 from forewarp.methods.voxel import effects
+from forewarp.methods.voxel.effects import LearnedUpsampler, UNet3d, outline_of
 from forewarp.ops.grid import index_of
 from forewarp.ops.splat import average_splat
 from forewarp.renderer import Renderer
@@ -299,3 +302,20 @@ def test_extreme_densities_stay_finite_in_values_and_gradients(raw):
     points, together = random_points(50), effects.Together(*grids)
     (together.colors(points, points, None).sum() + together.density(points).sum()).backward()
     assert all(grid.values.grad.isfinite().all() for grid in grids)
+
+
+@pytest.mark.parametrize(("learned", "levels"), [(False, 4), (True, 3)])
+def test_the_outline_has_the_modules_levels_and_all_its_parameters(learned, levels):
+    inpainter = UNet3d(channels=5, width=16, levels=levels, coverage_channel=True, head=not learned)
+    upsampler = LearnedUpsampler(channels=5, features=16, width=8) if learned else None
+    steps = outline_of(inpainter, upsampler, 32)
+    parts = [inpainter, upsampler] if learned else [inpainter]
+    assert sum(step["parameters"] for step in steps) == sum(map(parameter_count, parts))
+    does = Counter(step["does"] for step in steps)
+    assert (does["max_pool3d"], does["interpolate"]) == (levels - 1, levels - 1 + learned)
+    convolutions = 2 * levels + 2 * (levels - 1) + 2 * learned  # two a level on either side, two up-sampled
+    assert does["batch_norm"] == does["conv3d"] == does["relu"] == convolutions
+    assert steps[0]["shape"] == [6, 32, 32, 32]  # with the coverage
+    sides = [step["shape"][1] for step in steps]
+    assert (min(sides), sides[-1]) == (32 >> levels - 1, 63 if learned else 32)
+    assert not any(parameter.is_meta for part in parts for parameter in part.parameters())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -18,6 +19,7 @@ from forewarp.methods.method import FRACTION, check_least, check_number
 from forewarp.ops.backend import check_value
 from forewarp.ops.encode import encoded_size, positional_encoding, spherical_harmonics_1
 from forewarp.ops.grid import index_of, occupied_cells, trilinear
+from forewarp.ops.outline import outline
 from forewarp.ops.splat import average_splat, with_copies
 from forewarp.scene.box import Lattice
 
@@ -322,6 +324,26 @@ def interpolate_dense(dense: Tensor, crop: Crop, scale: int) -> Tensor:
     return functional.interpolate(dense, size=crop.scaled(scale).shape, mode="trilinear", align_corners=True)
 
 
+def filling(inputs: Tensor, crop: Crop, inpainter: nn.Module, upsampler: nn.Module | None) -> Tensor:
+    """(1, I, x, y, z) of ``crop`` -> what fills its holes, by the inpainter and, if it is learned, the
+    up-sampler: (1, 1 + C, x', y', z').
+    """
+    features = inpainter.features(inputs)
+    if isinstance(upsampler, LearnedUpsampler):
+        return upsampler.residual(features, crop)
+    return inpainter.residual(features)
+
+
+def outline_of(inpainter: UNet3d, upsampler: nn.Module | None, side: int = 64) -> list[dict]:
+    """List the steps of ``filling`` for a cube of ``side`` voxels (see ``ops.outline``)."""
+    parts = copy.deepcopy(nn.ModuleList(filter(None, (inpainter, upsampler)))).to("meta")
+    for part in parts:
+        part.recompute = False  # which would hide the steps
+    given = torch.empty(1, inpainter.channels + inpainter.coverage_channel, side, side, side, device="meta")
+    crop, (net, *rest) = Crop((0, 0, 0), (side - 1,) * 3), parts
+    return outline(lambda dense: filling(dense, crop, net, *rest or [None]), given)
+
+
 def inpaint(
     warped: RadianceGrid, coverage: Tensor | None, inpainter: nn.Module, upsampler: TrilinearUpsampler | None
 ) -> tuple[RadianceGrid, RadianceGrid, Tensor]:
@@ -332,9 +354,8 @@ def inpaint(
         cover = warped.values.new_ones(len(warped.values)) if coverage is None else coverage.clamp(max=1)
         cover = densify(replace(warped, values=cover[:, None]), crop).clamp(min=0)
         inputs = torch.cat([dense, cover], 1)
-    features = inpainter.features(inputs)
     learned = isinstance(upsampler, LearnedUpsampler)
-    residual = upsampler.residual(features, crop) if learned else inpainter.residual(features)
+    residual = filling(inputs, crop, inpainter, upsampler)
     lattice, region = warped.lattice, crop
     if upsampler is not None:
         scale = int(upsampler.scale)

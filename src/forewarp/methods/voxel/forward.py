@@ -9,7 +9,7 @@ from torch import Tensor
 
 from forewarp.fields.grids import DirectRadiance
 from forewarp.methods.method import Start, those_that_hold
-from forewarp.methods.voxel.effects import LearnedUpsampler, TrilinearUpsampler, inpaint
+from forewarp.methods.voxel.effects import LearnedUpsampler, TrilinearUpsampler, UNet3d, inpaint, outline_of
 from forewarp.methods.voxel.model import Factory, VoxelMethod, VoxelSnapshot
 from forewarp.methods.voxel.structure import EFFECTS
 from forewarp.ops.backend import check_value
@@ -71,6 +71,11 @@ class ForwardWarp(VoxelMethod):
             other = "set it to 2, or choose model/inpainter=none"
             check_value("model.upsampler.scale", scale, wanted, lambda scale: scale == int(scale), other)
         self.begin(start)
+
+    def outlines(self) -> dict[str, list[dict]]:
+        """Describe the inpainter, with a learned up-sampler's layers."""
+        drawn = isinstance(self.inpainter, UNet3d)
+        return {"inpainter": outline_of(self.inpainter, self.upsampler)} if drawn else {}
 
     def at(self, moment: Moment) -> VoxelSnapshot:
         """Warp the canonical radiance to a moment; one field for each rendering, the best last."""
