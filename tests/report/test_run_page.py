@@ -16,7 +16,7 @@ from tests.support.runs_on_disk import write_run, write_views
 
 NASTY = "<img src=x onerror=alert(1)>&\"'</script>"
 KNOWN = """html head meta title style body main header section footer div span figure figcaption video
-img input p label h1 h2 h3 b i small dl dt dd ul li code pre svg g line text circle polyline details
+img input p label h1 h2 h3 b i small dl dt dd ul ol li code pre svg g line text circle polyline details
 summary table tr th td script noscript"""
 
 
@@ -91,12 +91,12 @@ def test_the_page_tells_what_the_run_is(tmp_path, monkeypatch):
     page = write(folder, Media([shown()]))
     expected = ["ball", "forward, preset fast", "31.25 dB", "training 0:50", "1.00 GiB", "a cpu", "2,000,000"]
     expected += ["forewarp-train data.scene=ball", "trial +4.0 dB", "for 1:05", "off view trial +0.1 dB"]
-    expected += ["on extra", "22.0 dB", "test/r_2", "25.5 dB after 40 s", "particles 2,874"]
+    expected += ["on extra", "Through the scene's time", "test/r_2", "25.5 dB after 40 s", "particles 2,874"]
     expected += ["PSNR of what moves (dB) 17.25", "PSNR of what is still (dB) 33.50", "Mean error 0.125"]
     expected += ["nearest training frame 1 to 2 steps of 0.04 s", "what moves, known from images and poses"]
     expected += ["off by 0.1000 world units, 25% of their motion", "coarse: 100 steps in 0:50", "format=html"]
     assert [text for text in expected if text not in page.text] == []
-    assert page.tags.count("svg") == 3  # no events of a loss
+    assert page.tags.count("svg") == 2  # no events of a loss
     assert all(value.startswith("data:") for value in page.of("src"))
     assert page.of("href") == []
     assert all(alt is not None for alt in page.of("alt"))
@@ -129,7 +129,7 @@ BEGUN = {"config": {"stage": {"coarse": {}, "fine": {}}}}
         ({"metrics": {"effects": None}}, "No effects: neither a plan nor metrics.json", "Effects, and why"),
         ({"metrics": {"test": {"all": {"psnr": 20.0, "lpips_vgg": None}}}}, "LPIPS (vgg)", "None"),
         ({"curve": None}, "No PSNR against training time", "PSNR while it learned"),
-        ({"views": 0}, "No PSNR by view and through the scene's time", "view, from worst to best"),
+        ({"views": 0}, "No PSNR by view and through the scene's time", "The worst test views"),
         ({"views": 1}, "Through the scene's time", "No PSNR by view"),
         ({}, "No loss: neither TensorBoard's events nor csv/metrics.csv", "What is minimised"),
         ({}, "No pictures: the run's folder has none", "Pictures are"),
@@ -221,14 +221,12 @@ def test_one_view_is_the_best_of_all():
     assert [telling(views[:count]) for count in (0, 1, 2)] == [{}, {"a": "best"}, {"a": "best", "b": "worst"}]
 
 
-def test_words_are_of_all_views_where_only_some_are_drawn(tmp_path):
+def test_of_many_views_some_are_drawn_and_the_lowest_too(tmp_path):
     folder = told_run(tmp_path, views=1500)
     change_scores(folder, {1: {"psnr": 3.0}})
     page = write(folder)
-    assert len(re.findall(r" (?:3\d\d|40\d) of the 1500 views are drawn", page.text)) == 2
-    assert page.text.count("time 0.001: 3.00 dB") == 2
-    assert "The lowest, 3.0 dB, is test/r_1 at" in page.text
-    assert "of 1500 are more than 1 dB below it" in page.text
+    assert len(re.findall(r" (?:3\d\d|40\d) of the 1500 views are drawn", page.text)) == 1
+    assert page.text.count("time 0.001: 3.00 dB") == 1
     assert "The first 1000 of 1500 views" in page.text
     assert page.tags.count("tr") < 1010
 
@@ -263,7 +261,7 @@ def test_points_and_ticks_of_a_chart_share_their_axes(log):
 
 @pytest.mark.parametrize("points", [[(3.0, 5.0, "")], [(0.0, 0.0, "")], [(1.0, 2.0, ""), (2.0, 2.0, "")]])
 def test_without_a_range_everything_stays_inside(points):
-    drawn = chart("", "", [("", "stems", points)], ("x", "y"), mean=points[0][1])
+    drawn = chart("", "", [("", "dots", points)], ("x", "y"), mean=points[0][1])
     assert all(50 <= a <= 446 and 14 <= b <= 226 for _, _, of in drawn["series"] for a, b, _ in of)
 
 
@@ -294,13 +292,30 @@ def run(fitted, tmp_path_factory):
 
 def test_the_command_renders_the_telling_views(ok, run, tmp_path):
     done = ok("report", "kind=run", f"run={run}", f"out={tmp_path}/shown.html")
-    assert re.fullmatch(rf"written: {tmp_path}/shown.html: 0\.\d of at most 4 MB", done.out.strip())
+    *told, written = done.out.strip().splitlines()
+    assert re.fullmatch(rf"written: {tmp_path}/shown.html: 0\.\d of at most 4 MB", written)
+    assert told[0] == "why it is not better:"
+    assert any(" dB at most: Short training: 10 steps for each training image" in line for line in told)
     page = Page((tmp_path / "shown.html").read_text())
     names, labels = zip(*(alt.split(":")[0].split(", ") for alt in page.of("alt") if alt))
     assert {"best", "median", "worst"} <= set(labels)
     assert names[:4] == ("truth", "prediction", "error", "depth")
-    assert (page.tags.count("video"), page.tags.count("svg")) == (1, 4)
+    assert (page.tags.count("video"), page.tags.count("svg")) == (1, 3)
     assert "voxels" in page.text
+    # The same as data, and its worst views are shown: truth, prediction and error.
+    data = json.loads((tmp_path / "shown.json").read_text())
+    scores = {
+        i["name"]: i["scores"]["psnr"] for i in json.loads((run / "per_image.json").read_text())["images"]
+    }
+    assert [view["name"] for view in data["worst"]] == sorted(scores, key=scores.get)
+    assert all({"time", "psnr", "degrees", "gap"} <= view.keys() for view in data["worst"])
+    assert [label for label in labels if label in scores] == [
+        n for view in data["worst"] for n in [view["name"]] * 3
+    ]
+    assert data["views"] == len(scores)
+    assert told[1].strip() == f"{data['findings'][0]['brings']:.1f} dB at most: " + " ".join(
+        [data["findings"][0]["text"], f"Try {data['findings'][0]['try']} ({data['findings'][0]['advice']})."]
+    )
 
 
 @pytest.mark.slow
@@ -319,7 +334,9 @@ def test_a_run_without_rendering_data_or_its_end_still_has_a_page(ok, run, tmp_p
     assert not (tmp_path / "gone").exists()
     done = ok("report", "kind=run", f"run={folder}", "render=false")
     alts = " ".join(Page((folder / "page.html").read_text()).of("alt"))
-    assert ("depth, " in alts, "prediction, best: " in alts, done.out.count("\n")) == (False, True, 1)
+    assert ("depth, " in alts, "prediction, best: " in alts) == (False, True)
+    assert "error, test_space/r_000: one of the worst" in alts
+    assert "Rendering" not in done.out
     for name in ("metrics.json", "per_image.json", "images", "fine/done.json"):
         path = folder / name
         shutil.rmtree(path) if path.is_dir() else path.unlink()

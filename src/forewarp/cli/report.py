@@ -10,7 +10,7 @@ forewarp-report makes tables, curves and pages of runs that are already there. O
   kind=effects        planned runs beside the preset, every effect and none
   kind=search         the trials of a search, the best first: what was chosen, score, steps, seconds
   kind=compare        a few runs side by side, printed, and with out=FOLDER drawn
-  kind=run            the page of one run: its video, truth against prediction, curves, effects and why
+  kind=run            the page of one run: its video, views, why it is not better and what to try
 
   forewarp-report kind=price_list runs=FOLDER out=FOLDER
   forewarp-report kind=compare runs=[runs/demo/particles,runs/demo/forward] out=runs/demo
@@ -64,6 +64,7 @@ KINDS = {
 }
 MEGABYTES = 0.3, 1000  # least and most that may be asked for
 MOST_SIDE = 800  # pixels of a picture's longer side
+MOST_VIEWS = 64  # of which pixels are looked at
 
 
 def report(config: DictConfig) -> None:
@@ -129,7 +130,8 @@ def run_page(config: DictConfig) -> str:
 
     def written() -> str:
         size = write_run_page(file, row, media, megabytes=most)
-        return "\n".join([*media.missing, f"written: {file}: {size / 1e6:.1f} of at most {most:g} MB"])
+        told = media.diagnosis.lines() if media.diagnosis else []
+        return "\n".join([*media.missing, *told, f"written: {file}: {size / 1e6:.1f} of at most {most:g} MB"])
 
     media = media_of(row, config.path)  # loads torch; mistakes have been answered before
     room_of(row, media, most)  # refuses before minutes of rendering
@@ -149,7 +151,7 @@ def run_page(config: DictConfig) -> str:
 
 def _render(config: DictConfig, row: dict, media) -> None:
     """Render the telling views, and a player or, where there can be none, the video if the run has none;
-    ``media`` takes each once it is made.
+    ``media`` takes each once it is made. First find out where the error of the stored views is.
     """
     from forewarp.cli.export import source_of
     from forewarp.evaluation.images import parts_of
@@ -161,6 +163,7 @@ def _render(config: DictConfig, row: dict, media) -> None:
     saved = saved_config(str(row["folder"]), config)
     run, module = opened(saved)
     targets = run.datamodule.targets("test")
+    _diagnose(row, media, run, module)
     places = {frame.name: number for number, frame in enumerate(targets.frames)}
     views = []
     for name, why in telling(row["images"]).items():
@@ -184,6 +187,36 @@ def _render(config: DictConfig, row: dict, media) -> None:
     film = OmegaConf.load(project_root() / "conf" / "render.yaml")
     film.path = config.path or ("both" if row["config"].get("capture") == "cut_out" else "swing")
     media.video, media.about = write_film(film, run, module), FILMS[film.path]
+
+
+def _diagnose(row: dict, media, run, module) -> None:
+    """Compare stored test views with the data, and training views with the fit; tell ``media``."""
+    from forewarp.data.batches import COLORS, color_of
+    from forewarp.drawing.images import error_colors
+    from forewarp.evaluation.stored import placed, stored_views, view_errors
+    from forewarp.report.diagnosis import diagnose
+    from forewarp.report.run_page import triple
+    from forewarp.runs.fitted import training_psnr
+
+    targets, protocol = run.datamodule.targets("test"), row["metrics"].get("protocol", {})
+    if protocol.get("background") in COLORS:  # forewarp-evaluate may have chosen another than the run's
+        targets.background = color_of(protocol["background"])
+    if protocol.get("reduced"):
+        targets = targets.reduced(protocol["reduced"])
+    scene = run.datamodule.scene
+    (views, fit), scores = placed(scene), {image["name"]: image["psnr"] for image in row["images"]}
+    for target, prediction in stored_views(targets, row["folder"], scores, MOST_VIEWS):
+        views[target.frame.name] |= view_errors(target, prediction, scene)
+    fit["psnr"] = training_psnr(run, module)[0]
+    media.diagnosis = diagnose(row, views, fit)
+    if media.diagnosis is None:
+        return
+    listed = {view["name"]: view["psnr"] for view in media.diagnosis.worst}
+    shown = {}
+    for target, prediction in stored_views(targets, row["folder"], listed, len(listed)):
+        pictures = target.rgb, prediction, error_colors(target.rgb, prediction)
+        shown[target.frame.name] = triple(target.frame.name, *pictures)
+    media.worst = [shown[name] for name in listed if name in shown]
 
 
 def main() -> None:

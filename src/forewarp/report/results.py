@@ -56,7 +56,7 @@ OWN = "run|sheets|paths.runs|paths.data"  # keys that say where a run's files ar
 # What stands for the folders of whoever types a command again.
 PLACES = {"paths.scenes": "DATASETS", "data.root": "SCENES", "lpips_weights": "WEIGHTS"}
 UNREADABLE = OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError, yaml.YAMLError
-_ENDS = 0.1  # share of the time that counts as its first and last part
+ENDS = 0.1  # share of the time that counts as its first and last part
 _EARLY, _LATE = 0.95, 1.5  # of its minutes: less was ended by steps, more had a last step that took long
 
 
@@ -395,8 +395,8 @@ def ends_below(views: Sequence[tuple[float, float]]) -> float | None:
     >>> ends_below([(0.0, 30.0), (0.05, 31.0), (0.5, 34.0), (0.6, 33.0), (1.0, 32.0)])
     2.5
     """
-    ends = [psnr for time, psnr in views if not _ENDS < time < 1 - _ENDS]
-    others = [psnr for time, psnr in views if _ENDS < time < 1 - _ENDS]
+    ends = [psnr for time, psnr in views if not ENDS < time < 1 - ENDS]
+    others = [psnr for time, psnr in views if ENDS < time < 1 - ENDS]
     return statistics.median(others) - statistics.fmean(ends) if ends and others else None
 
 

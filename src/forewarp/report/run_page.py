@@ -16,10 +16,11 @@ from typing import TYPE_CHECKING
 
 from markupsafe import Markup, escape
 
-from forewarp.files import read_rows, replace_file
+from forewarp.files import read_rows, replace_file, write_json
 from forewarp.metrics.registry import metric_of
 from forewarp.progress import time_text
 from forewarp.report.choices import seconds_to
+from forewarp.report.diagnosis import Diagnosis, diagnose, errors_on_sheets
 from forewarp.report.figures import sheets_of, thirds
 from forewarp.report.results import KINDS, Row, read_run, refused
 from forewarp.report.tables import TEMPLATES, Column, Table, rendered, score_columns
@@ -27,7 +28,7 @@ from forewarp.report.tables import TEMPLATES, Column, Table, rendered, score_col
 if TYPE_CHECKING:  # so that what is refused waits for no torch
     from torch import Tensor
 
-WHYS = "best", "median", "worst", "earliest", "latest"  # views to look at, as they are shown
+WHYS = "best", "median", "worst"  # views to look at, as they are shown
 PARTS = "truth", "prediction", "error"  # of a sheet
 # Videos in the order in which one of a folder is taken.
 FILMS = {
@@ -40,7 +41,7 @@ FILMS = {
 DRAWN, LISTED, LOSSES = 400, 1000, 150  # at most: views in a chart and in the table, points of a stage's loss
 PICTURES = 0.6  # share of the room that pictures may take; the video has the rest
 LADDER = ((800, 92), (640, 90), (480, 88), (320, 80), (200, 70), (120, 60))  # most pixels of a side, quality
-THUMB = 96, 70
+THUMB, SMALL = (96, 70), (240, 80)  # of the choice of a view, and of those that are listed as the worst
 NOTES = 1000  # bytes that are kept for what the page says about sizes
 
 
@@ -61,6 +62,7 @@ class Shown:
 class Media:
     """What a page shows: views, the file of a video and what is to be seen in it; what is missing and why.
 
+    ``diagnosis`` says where the error is, and ``worst`` shows the views that it lists, each ``why`` its name.
     A ``player`` is a page that plays the scene, shown in place of a video; ``scripts`` are the hashes of its
     scripts, as a policy names them.
     """
@@ -71,6 +73,8 @@ class Media:
     missing: Sequence[str] = ()
     player: str = ""
     scripts: Sequence[str] = ()
+    diagnosis: Diagnosis | None = None
+    worst: Sequence[Shown] = ()
 
     def play(self, player: str, scripts: Sequence[str], room: float) -> bool:
         """Take a player in place of a video, if it is no larger than a video's share of ``room`` bytes."""
@@ -158,23 +162,23 @@ def _between(known: Sequence[tuple[int, float]], step: int) -> float:
 
 
 def telling(images: Sequence[dict]) -> dict[str, str]:
-    """Choose the views to look at: the best, the middle one and the worst by PSNR, then the ends of the time.
+    """Choose the views to look at: the best, the middle one and the worst by PSNR.
 
-    >>> seen = [{"name": n, "time": t, "psnr": p} for n, t, p in (("a", 0, 30), ("b", 0.5, 20), ("c", 1, 40))]
+    >>> seen = [{"name": n, "psnr": p} for n, p in (("a", 30), ("b", 20), ("c", 40))]
     >>> telling(seen), telling(seen[:2])
     ({'c': 'best', 'a': 'median', 'b': 'worst'}, {'a': 'best', 'b': 'worst'})
     """
     ranked = [image["name"] for image in sorted(images, key=lambda image: (-image["psnr"], image["name"]))]
-    by_time = [image["name"] for image in sorted(images, key=lambda image: (image["time"], image["name"]))]
-    names = [ranked[0], ranked[-1], ranked[len(ranked) // 2], by_time[0], by_time[-1]] if images else []
+    names = [ranked[0], ranked[-1], ranked[len(ranked) // 2]] if images else []
     chosen: dict[str, str] = {}
-    for why, name in zip(("best", "worst", "median", "earliest", "latest"), names):
+    for why, name in zip(("best", "worst", "median"), names):
         chosen.setdefault(name, why)
     return dict(sorted(chosen.items(), key=lambda item: WHYS.index(item[1])))
 
 
 def media_of(row: Row, path: str | None = None) -> Media:
-    """Return what the folder has: truth, prediction and error of views, and a video made after training.
+    """Return what the folder has: truth, prediction and error of views, where the error is as far as these
+    tell, and a video made after training.
 
     Of the telling views those that have a sheet; then others, named for what they are among those with one;
     without any the last picture that training drew.
@@ -196,12 +200,25 @@ def media_of(row: Row, path: str | None = None) -> Media:
             told = f"stage {stage} at {int(file.stem.split('_')[0])} %"
             files = files or [("in training", told, file)]
     shown = [Shown(why, told, dict(zip(PARTS, thirds(read_image(file))))) for why, told, file in files]
+    media = Media(shown, diagnosis=diagnose(row, errors_on_sheets(row)))
+    worst = media.diagnosis.worst if media.diagnosis else ()
+    listed = [view["name"] for view in worst if view["name"] in sheets]
+    media.worst = [triple(name, *thirds(read_image(sheets[name]))) for name in listed]
     done = max((file.stat().st_mtime_ns for file in row["folder"].glob("*/done.json")), default=0)
     for name in [path] if path else FILMS:
         file = row["folder"] / "videos" / f"{name}.mp4"
         if file.is_file() and file.stat().st_mtime_ns >= done:
-            return Media(shown, file, FILMS[name])
-    return Media(shown)
+            media.video, media.about = file, FILMS[name]
+            break
+    return media
+
+
+def triple(name: str, *pictures: Tensor) -> Shown:
+    """Show a view that is among the worst: its truth, prediction and error (H, W, 3), made small."""
+    from forewarp.drawing.images import at_most
+
+    small = dict(zip(PARTS, (at_most(picture, SMALL[0]) for picture in pictures)))
+    return Shown(name, "one of the worst", small)
 
 
 def about(row: Row, name: str) -> str:
@@ -211,7 +228,7 @@ def about(row: Row, name: str) -> str:
 
 
 def write_run_page(file: Path, row: Row, media: Media, *, megabytes: float) -> int:
-    """Write the page of a run.
+    """Write the page of a run, and beside it what its diagnosis says, as ``.json``.
 
     Args:
         file: of the page.
@@ -227,6 +244,8 @@ def write_run_page(file: Path, row: Row, media: Media, *, megabytes: float) -> i
     """
     text = page(row, media, *encoded(media, room_of(row, media, megabytes))).encode()
     replace_file(file, text)
+    if media.diagnosis is not None:
+        write_json(file.with_suffix(".json"), {"run": near(str(row["folder"])), **media.diagnosis.data()})
     return len(text)
 
 
@@ -236,7 +255,7 @@ def room_of(row: Row, media: Media, megabytes: float) -> float:
     Raises:
         ValueError: in one line, if the text alone is larger, or the run's files hold what no page can show.
     """
-    views = [dict.fromkeys([*shown.pictures, "thumb"], "") for shown in media.views]
+    views = [dict.fromkeys([*shown.pictures, "thumb"], "") for shown in (*media.views, *media.worst)]
     with refused(f"run: expected a run whose files can be shown, but got {row['folder']} (", ")"):
         bare = len(page(row, media, views, "data:" if media.video else "").encode()) + NOTES
     room = 1e6 * megabytes - bare
@@ -250,15 +269,15 @@ def encoded(media: Media, room: float) -> tuple[list[dict[str, str]], str, str, 
     """Encode pictures and video into at most ``room`` bytes of the page.
 
     Returns:
-        as ``data:`` addresses the pictures and ``thumb`` of each view and the video, "" for none; what became
-        of the pictures and of the video so that they fit.
+        as ``data:`` addresses the pictures and ``thumb`` of each view, the pictures of each of the worst, and
+        the video, "" for none; what became of the pictures and of the video so that they fit.
     """
     from forewarp.drawing.images import at_most, jpeg_bytes, smaller_video
 
     def jpeg(picture: Tensor, side: int, quality: int) -> str:
         return _address("image/jpeg", jpeg_bytes(at_most(picture.cpu(), side), quality))
 
-    pictures = [picture for shown in media.views for picture in shown.pictures.values()]
+    pictures = [picture for shown in (*media.views, *media.worst) for picture in shown.pictures.values()]
     largest = max([*(shown.side for shown in media.views), *(max(p.shape[:2]) for p in pictures)], default=0)
     views, note, left = [], "left out, as the page has no room for them; raise megabytes", room
     for side, quality in LADDER if pictures else ():
@@ -266,6 +285,8 @@ def encoded(media: Media, room: float) -> tuple[list[dict[str, str]], str, str, 
         for shown in media.views:
             thumb = jpeg(next(iter(shown.pictures.values())), *THUMB)
             found.append({n: jpeg(p, side, quality) for n, p in shown.pictures.items()} | {"thumb": thumb})
+        for shown in media.worst:
+            found.append({n: jpeg(p, *map(min, SMALL, (side, quality))) for n, p in shown.pictures.items()})
         size = sum(len(text) for view in found for text in view.values())
         if size <= (PICTURES * room if media.video else room):
             smaller = f", scaled from {largest} to {side} pixels" if largest > side else ""
@@ -291,11 +312,16 @@ def page(
     kinds = [{"kind": KINDS.get(kind, kind), "scores": scores} for kind, scores in row["test"].items()]
     images = [image | {"kind": KINDS.get(image["ability"], image["ability"])} for image in images]
     values = {"row": row, "media": media, "views": list(zip(media.views, views)), "video": video}
+    values["worst"] = {shown.why: (shown, v) for shown, v in zip(media.worst, views[len(media.views) :])}
     values |= {"pictures_note": pictures_note, "video_note": video_note, "near": near, "time_text": time_text}
     values |= {"protocol": row["metrics"].get("protocol", {}), "flow": row["metrics"].get("flow") or {}}
-    charts = {"Where it is good, and where not": _of_views(row["images"]) if row["images"] else []}
-    charts["How it got there"] = [*_accuracy(row), *_losses(row)]
-    values |= {"charts": charts, "effects": _effects(row), "abilities": KINDS, "metric_of": metric_of}
+    values |= {"by_time": _of_views(row["images"]), "charts": [*_accuracy(row), *_losses(row)]}
+    values |= {
+        "diagnosis": media.diagnosis,
+        "effects": _effects(row),
+        "abilities": KINDS,
+        "metric_of": metric_of,
+    }
     values |= {"budget": row["config"]["budget"], "folder": shlex.quote(near(str(row["folder"])))}
     values |= {"scores": _score_table(kinds, {"kind": "test views"})}
     values |= {"listed": _score_table(images, {"name": "view", "kind": "kind", "time": Column("time", 3)})}
@@ -399,7 +425,7 @@ def chart(
     Args:
         title: above the picture.
         says: what is to be seen, below it.
-        series: name ("" for none in the legend), kind (``line``, ``dots``, or ``stems`` from the mean) and
+        series: name ("" for none in the legend), kind (``line`` or ``dots``) and
             points (x, y, text where the pointer rests, "" for none).
         axes: titles of x and y.
         logs: whether they are logarithmic.
@@ -416,31 +442,23 @@ def chart(
 
 
 def _of_views(images: Sequence[dict]) -> list[dict]:
-    """Show PSNR of views through the scene's time, and from the worst to the best."""
-    ranked, by_time = (sorted(images, key=lambda image: image[key]) for key in ("psnr", "time"))
-    low, high, mean = ranked[0], ranked[-1], fmean(image["psnr"] for image in images)
-
-    def drawn(images: Sequence[dict]) -> list[tuple[int, dict, str]]:
-        """About ``DRAWN`` views, evenly, the last and the lowest too: number, view, what it is."""
-        kept = sorted({*range(0, len(images), -(-len(images) // DRAWN)), len(images) - 1, images.index(low)})
-        told = "{name}, time {time:.3f}: {psnr:.2f} dB"
-        return [(i + 1, images[i], told.format(**images[i])) for i in kept]
-
+    """Show PSNR of views through the scene's time; nothing without views."""
+    if not images:
+        return []
+    by_time, low = (
+        sorted(images, key=lambda image: image["time"]),
+        min(images, key=lambda image: image["psnr"]),
+    )
+    # About ``DRAWN`` views, evenly, the last and the lowest too.
+    kept = {*range(0, len(images), -(-len(images) // DRAWN)), len(images) - 1, by_time.index(low)}
+    drawn, told = [by_time[i] for i in sorted(kept)], "{name}, time {time:.3f}: {psnr:.2f} dB"
     kinds, series = list(dict.fromkeys(image["ability"] for image in images)), []
     for kind in kinds:
-        points = [(v["time"], v["psnr"], told) for _, v, told in drawn(by_time) if v["ability"] == kind]
+        points = [(v["time"], v["psnr"], told.format(**v)) for v in drawn if v["ability"] == kind]
         series.append((KINDS.get(kind, kind) if len(kinds) > 1 else "", "dots", points))
-    stems = ("", "stems", [(number, view["psnr"], told) for number, view, told in drawn(ranked)])
-    count, below = len(stems[2]), sum(image["psnr"] < mean - 1 for image in images)
-    fewer = f" {count} of the {len(images)} views are drawn; the words are of all." * (count < len(images))
-    lowest = f"The lowest, {low['psnr']:.1f} dB, is {low['name']} at time {low['time']:.2f}."
-    dots = f"A dot is a test view. {lowest}{fewer}"
-    worst, best = f"{low['psnr']:.1f} dB", f"{high['psnr']:.1f} dB"
-    ranks = f"From the worst view ({worst}) to the best ({best}), from their mean; {below} of {len(images)} "
-    ranks += f"{'is' if below == 1 else 'are'} more than 1 dB below it.{fewer}"
-    by_time = chart("Through the scene's time", dots, series, ("time in the scene", "PSNR (dB)"), mean=mean)
-    axes = ("view, from worst to best", "PSNR (dB)")
-    return [by_time, chart("View by view", ranks, [stems], axes, mean=mean)]
+    fewer = f" {len(drawn)} of the {len(images)} views are drawn." * (len(drawn) < len(images))
+    axes, mean = ("time in the scene", "PSNR (dB)"), fmean(image["psnr"] for image in images)
+    return [chart("Through the scene's time", f"A dot is a test view.{fewer}", series, axes, mean=mean)]
 
 
 def _accuracy(row: Row) -> list[dict]:
