@@ -156,6 +156,13 @@ def test_training_images_that_are_far_better_are_overfit_or_far(tmp_path, degree
     assert (first.kind, first.brings) == (kind, pytest.approx(9.7, abs=0.1))
 
 
+def test_an_exposure_of_test_views_is_no_overfitting(tmp_path):
+    sums = [defect("exposure", i) for i in range(5)]
+    fit = {"images": 20, "psnr": 25.3 + 10.0}
+    first, *_ = diagnosed(run_with(tmp_path, steps=100_000), lambda i: sums[i % 5], fit).findings
+    assert first.kind == "exposure"
+
+
 def test_too_few_steps_come_first_unless_the_curve_is_flat(tmp_path):
     assert more_steps(2.0, 0.0) == 10.0
     first = diagnosed(run_with(tmp_path, steps=200), fit={"images": 50}).findings[0]

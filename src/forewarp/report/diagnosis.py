@@ -10,12 +10,13 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
-from statistics import fmean, stdev
+from statistics import fmean
 
 from forewarp.report.results import ENDS, KINDS, Row
+from forewarp.report.statistics import Estimate, lies_below
 
 LEAST = 0.3  # dB that a finding must promise
-LEVEL = 0.005  # of a test's error: 5 % over the ten questions that are asked
+QUESTIONS = 10  # that are asked of a run, and share the errors of their tests
 FEWEST = 3  # views of a group
 WORST = 5  # views that are listed
 MOST = 6  # findings that are shown
@@ -127,7 +128,9 @@ def diagnose(
         if share is not None:
             found.append((kind, text, share))
     found += _of_causes(measured, [image["ratio"] for image in images if "sums" in image])
-    found += _of_fit(row, images, fit, flagged)
+    # An exposure of their own tells test views from training images, too.
+    lit = max([share for kind, _, share in found if kind == "exposure"], default=0.0)
+    found += _of_fit(row, images, fit, flagged, -10 * math.log10(max(1 - lit, 1e-10)))
     best: dict[str, tuple[str, str, float]] = {}
     for kind, text, share in found:  # of each kind the one that may bring most
         if kind not in best or share > best[kind][2]:
@@ -185,18 +188,16 @@ class _Views:
         return Split(name, "views", count / len(chosen), inside / total, _decibels(inside / count))
 
     def excess(self, chosen: Sequence[bool]) -> float | None:
-        """Return the share of the error by which a group is worse than the rest; None if that may be chance
-        (Welch's t-test of PSNR, one-sided).
-        """
-        from scipy.stats import ttest_ind
-
-        inside, rest = ([v for v, is_in in zip(self.psnr, chosen) if is_in is side] for side in (True, False))
-        if not ttest_ind(inside, rest, equal_var=False, alternative="less").pvalue < LEVEL:
+        """Return the share of the error by which a group is worse than the rest; None if it may be chance."""
+        inside, rest = (self._of(self.psnr, chosen, side) for side in (True, False))
+        if not lies_below(Estimate.of(inside), Estimate.of(rest), QUESTIONS):
             return None
-        inside, rest = (
-            [e for e, is_in in zip(self.errors, chosen) if is_in is side] for side in (True, False)
-        )
+        inside, rest = (self._of(self.errors, chosen, side) for side in (True, False))
         return (sum(inside) - len(inside) * fmean(rest)) / sum(self.errors)
+
+    @staticmethod
+    def _of(values: Sequence[float], chosen: Sequence[bool], side: bool) -> list[float]:
+        return [value for value, is_in in zip(values, chosen) if is_in is side]
 
 
 def _groups(images: Sequence[Mapping], fit: Mapping, row: Row):
@@ -288,9 +289,11 @@ def _of_causes(measured: Sequence[Mapping], ratios: Sequence[float]) -> list[tup
 
 
 def _of_fit(
-    row: Row, images: Sequence[Mapping], fit: Mapping, flagged: set[str]
+    row: Row, images: Sequence[Mapping], fit: Mapping, flagged: set[str], explained: float
 ) -> list[tuple[str, str, float]]:
-    """Say what more training may bring, and what test views lack against training images."""
+    """Say what more training may bring, and what test views that are not ``flagged`` lack against training
+    images, beyond so many dB that are ``explained``.
+    """
     found, steps = [], steps_of(row, fit)
     rise = still_rising(row["points"])
     if steps is not None and (gain := more_steps(steps, rise)) >= LEAST:
@@ -305,6 +308,7 @@ def _of_fit(
     limit = max(_FAR, _SPACINGS * fit.get("spacing", 0.0))
     far = [image["degrees"] for image in rest if image.get("degrees", 0.0) > limit]
     lacks = fit["psnr"] - fmean(image["psnr"] for image in rest) if len(rest) >= FEWEST else 0.0
+    lacks -= explained
     share = 1 - 10 ** (-lacks / 10)
     reached = f"training images are reached to {fit['psnr']:.1f} dB, {lacks:.1f} dB above"
     if lacks > 0 and len(far) > len(rest) / 2:
@@ -347,14 +351,8 @@ def more_steps(steps: float, rise: float | None) -> float:
 
 
 def _surely_above_0(values: Sequence[float]) -> bool:
-    """Tell whether the mean of independent values is above 0 (Student's t-test, one-sided)."""
-    from scipy.stats import ttest_1samp
-
-    if len(values) < FEWEST:
-        return False
-    if stdev(values) == 0:
-        return values[0] > 0
-    return bool(ttest_1samp(values, 0.0, alternative="greater").pvalue < LEVEL)
+    """Tell whether the mean of independent values, a view each, is above 0."""
+    return bool(values) and Estimate.of(values).sign(QUESTIONS) == 1
 
 
 def _holds(split: Split, of: str) -> str:

@@ -166,6 +166,24 @@ def rank(rows: Mapping[object, Mapping[object, float]], higher_is_better: bool =
     return places
 
 
+def lies_below(first: Estimate, second: Estimate, questions: int = 1) -> bool:
+    """Tell whether one mean lies below another of other independent values, whose spreads may differ (Welch's
+    t-test); no where either has fewer than ``LEAST`` values. ``questions`` as of ``half_width_among``.
+
+    >>> low, high = Estimate(20.0, 1.0, 5), Estimate(23.0, 2.0, 5)  # 3 standard errors
+    >>> lies_below(low, high), lies_below(low, high, questions=10), lies_below(high, low)
+    (True, False, False)
+    """
+    if min(first.count, second.count) < LEAST:
+        return False
+    parts = [of.deviation**2 / of.count for of in (first, second)]
+    if not (error := math.sqrt(sum(parts))):
+        return first.mean < second.mean
+    freedom = sum(parts) ** 2 / sum(p**2 / (of.count - 1) for p, of in zip(parts, (first, second)))
+    quantile = float(stdtrit(freedom, 1 - (1 - LEVEL) / 2 / questions))
+    return second.mean - first.mean > quantile * error
+
+
 def by_chance(changes: Iterable[Estimate | None]) -> str:
     """Say of a page's differences how many would leave out 0 by chance, and how many do.
 
