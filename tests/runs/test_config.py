@@ -9,6 +9,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 
 from forewarp.files import MOST_CONFIG
+from forewarp.runs import config
 from forewarp.runs.config import (
     HOMES,
     check_values,
@@ -255,3 +256,32 @@ def test_what_is_no_name_of_a_package_is_refused(named, monkeypatch):
         monkeypatch.setenv("FOREWARP_TRUST", named)
         with pytest.raises(ValueError, match="^FOREWARP_TRUST: expected names of packages, as FOREWARP_TR"):
             trust_of()
+
+
+def test_sweeps_with_other_budgets_have_folders_of_their_own(in_tmp, monkeypatch):
+    place = {"sweep": True}
+    monkeypatch.setattr(config, "is_swept", lambda: place["sweep"])
+
+    def folder(*words):
+        monkeypatch.setattr(config, "typed_overrides", lambda: list(words))
+        monkeypatch.setattr(config, "constant", {word.partition("=")[0] for word in words} - {"seed"})
+        job = composed("experiment=demo", "budget.minutes=null", *words)
+        return config.hashed(job), job
+
+    short, longer = (["budget.iterations=3"], ["budget.iterations=5"])
+    runs = [folder(*budget, f"seed={seed}")[0].run for budget in (short, longer) for seed in (0, 1)]
+    assert len(set(runs)) == 4
+    assert all(re.fullmatch(r"runs/vehicle/particles-demo-seed[01]-\w{10}", run) for run in runs)
+    others = [folder(*short, "seed=0", word)[0].run for word in ("data.held_out=8", "data.root=elsewhere")]
+    assert len({*runs, *others}) == 6
+    place["sweep"] = False
+    plain, job = folder(*short, "seed=0")
+    assert plain.run == "runs/vehicle/particles-demo-seed0"  # as before, and as a sweep named it
+    stored = in_tmp / plain.run / "config.yaml"
+    stored.parent.mkdir(parents=True)
+    stored.write_text(OmegaConf.to_yaml(job, resolve=True))
+    place["sweep"] = True
+    assert folder(*short, "seed=0")[0].run == plain.run
+    assert folder(*longer, "seed=0")[0].run == runs[2]
+    stored.write_text("nothing")
+    assert folder(*short, "seed=0")[0].run == runs[0]

@@ -15,6 +15,7 @@ import os
 import re
 import sys
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from pathlib import Path
 
 import yaml
@@ -75,11 +76,17 @@ def hashed(config: DictConfig) -> DictConfig:
 
     So each configuration has a folder of its own, and a finished job is found again. A precision other than
     32-true counts too, and for a run bounded by minutes the device and the number of threads. Before the
-    digits of a job of a sweep stands what tells it apart; so do they where a sweep names no folders.
+    digits of a job of a sweep stands what tells it apart; so do they where a sweep names no folders, even if
+    nothing but the seed differs: the next sweep may have another budget. A folder without digits that holds
+    this very run, as earlier versions named them, is found again.
     """
     typed, run = typed_overrides(), str(config.run)
     words = in_words([word for word in typed if key_of(word) not in constant]) if is_swept() else ""
-    if words and HASH not in run and "run" not in map(key_of, typed):
+    usual = f"{config.data.get('scene')}/{config.model.name}-{config.preset.name}-seed{config.seed}"
+    is_usual = is_swept() and Path(run).as_posix().endswith(usual)
+    if (words or is_usual) and HASH not in run and "run" not in map(key_of, typed):
+        if holds(Path(run), config):
+            return config
         run += f"-{HASH}"
     if HASH in run:
         digits = content_hash(config)
@@ -87,6 +94,16 @@ def hashed(config: DictConfig) -> DictConfig:
         pattern = glob.escape(run).replace(HASH, f"*{digits}")
         config.run = next(iter(sorted(glob.glob(pattern))), run.replace(HASH, told))
     return config
+
+
+def holds(folder: Path, config: DictConfig) -> bool:
+    """Tell whether a folder holds a run of this config; one that cannot be read does not."""
+    path = folder / "config.yaml"
+    if not path.is_file():
+        return False
+    with suppress(ValueError, OSError):
+        return content_hash(read_config(path, None)) == content_hash(config)
+    return False
 
 
 def is_swept() -> bool:
