@@ -73,9 +73,12 @@ def test_few_images_that_show_no_change_say_nothing(changes, rests):
     assert Evidence(replace(QUIET, **changes)).silhouettes_rest is rests
 
 
-def test_a_budget_too_small_to_tell_changes_nothing():
+def test_silhouettes_alone_switch_nothing_off():
     assert on(PARTICLES, OF_PARTICLES, QUIET) == set(OF_PARTICLES)
-    assert Evidence(QUIET).of_time()[1].endswith("to tell more: raise budget.minutes")
+    unfit = Evidence(QUIET, unfit="a still fit shows nothing")
+    decisions = {d.effect: d for d in decide(PARTICLES, unfit, OF_PARTICLES, {})}
+    assert {name for name, decision in decisions.items() if decision.on} == set(OF_PARTICLES)
+    assert decisions["motion"].because.endswith("and a still fit shows nothing, so it is left on")
 
 
 def test_each_reason_has_its_number():

@@ -6,7 +6,10 @@ import pytest
 import yaml
 from omegaconf import OmegaConf
 
+from forewarp import clock
 from forewarp.data.module import SceneDataModule
+from forewarp.methods.particles.model import Particles
+from forewarp.methods.voxel.forward import ForwardWarp
 from forewarp.planning.plan import refuse
 from forewarp.planning.plan_file import read_plan, with_plan, write_plan
 from forewarp.synth.scenes import synthesize
@@ -68,26 +71,108 @@ def test_a_plan_is_made_once_told_and_fitted(forewarp, ok, scenes, monkeypatch, 
     assert (fit / "plan.yaml").read_text() == file.read_text()
 
 
-@pytest.mark.slow
-def test_auto_fits_a_scene_that_stands_still_without_what_it_does_not_call_for(
-    forewarp, ok, in_tmp, monkeypatch
-):
+@pytest.fixture(scope="module")
+def stills(tmp_path_factory):
+    """A folder with the scene ``still``, 40 images of 24 x 24 pixels in which nothing moves."""
+    root = tmp_path_factory.mktemp("stills")
     sizes = {"size": 24, "frames": 40, "test_views": (1, 1, 0), "val_views": 0, "samples_per_pixel": 1}
-    synthesize(in_tmp / "scenes" / "still", motion="still", **sizes)
-    monkeypatch.setattr("forewarp.planning.plan.SHARE", 1.0)
-    short = ["budget.iterations=720", "budget.minutes=null", "evaluate=false", "run=still"]
-    typed = ["model=particles", *TINY, "data.root=scenes", "data.scene=still", *short]
+    synthesize(root / "still", motion="still", **sizes)
+    return root
+
+
+@pytest.fixture
+def made(forewarp, stills, in_tmp):
+    """Plan the scene that stands still; returns ``plan.yaml`` and what was printed."""
+
+    def plan(name, *typed):
+        scene = [f"data.root={stills}", "data.scene=still", f"plan.folder={name}"]
+        done = forewarp("plan", *TINY, *scene, *typed)
+        assert done.status == 0, done.err
+        return yaml.safe_load((in_tmp / name / "plan.yaml").read_text()), done.out
+
+    return plan
+
+
+@pytest.mark.parametrize(
+    ("method", "model", "steps"),
+    [(Particles, ["model=particles"], 30), pytest.param(ForwardWarp, VOXELS, 10, marks=pytest.mark.slow)],
+)
+def test_a_plan_depends_neither_on_the_budget_nor_on_the_clock(made, monkeypatch, method, model, steps):
+    monkeypatch.setattr(method, "still_steps", steps)
+    plan, printed = made("slow", *model, "budget.minutes=5")
+    assert plan["fit"]["steps"] == steps
+    assert plan["fit"]["share"] == pytest.approx(plan["fit"]["seconds"] / 300, abs=1e-3)  # both are rounded
+    assert f"for {steps} steps of a still fit: " in " ".join(printed.split())
+    monkeypatch.setitem(clock.KINDS, "wall", lambda read=clock.KINDS["wall"]: 100 * read())
+    for number, budget in enumerate((["minutes=0.001"], ["minutes=null", "iterations=4"])):
+        hasty, printed = made(f"fast{number}", *model, *(f"budget.{word}" for word in budget))
+        assert hasty["fit"]["steps"] == steps
+        assert hasty["fit"]["share"] > 1
+        assert "% of the budget, on top of it" in " ".join(printed.split())
+        for key in ("overrides", "effects", "evidence"):
+            assert hasty[key] == plan[key], key
+
+
+def test_what_is_typed_changes_no_evidence(made, monkeypatch):
+    monkeypatch.setattr(Particles, "still_steps", 20)
+    plan, _ = made("auto", "model=particles")
+    moving, _ = made("typed", "model=particles", "model/motion=cosines", "model.view_dependence=2")
+    assert moving["evidence"] == plan["evidence"]
+    assert moving["effects"]["motion"]["choice"] == "cosines"
+    every = [f"model/{name}=none" for name in plan["effects"]]
+    assert "fit" not in made("all", "model=particles", *every)[0]  # nothing is left to decide
+
+
+def test_a_method_that_names_no_steps_keeps_its_preset(made, monkeypatch):
+    monkeypatch.setattr(Particles, "still_steps", None)
+    plan, printed = made("none", "model=particles")
+    assert "fit" not in plan
+    assert "still fit" not in printed.partition("\n")[0]
+    motion = plan["effects"]["motion"]
+    assert motion["on"]
+    assert motion["because"].endswith("the method names no steps of a still fit, so it is left on")
+
+
+@pytest.mark.slow
+def test_auto_fits_a_scene_that_stands_still_without_what_it_does_not_call_for(forewarp, ok, in_tmp, stills):
+    short = ["budget.iterations=30", "budget.minutes=null", "evaluate=false", "run=still"]
+    typed = ["model=particles", *TINY, f"data.root={stills}", "data.scene=still", *short]
     ok("train", *typed, "effects=auto")
     made = yaml.safe_load((in_tmp / "still" / "plan.yaml").read_text())
     assert made["evidence"]["residual"].keys() == {"by_time", "by_direction"}
     fitted = [
         json.loads(path.read_text())["seconds"] for path in in_tmp.glob("runs/still/plan-*/still/*/done.json")
     ]
-    assert made["seconds"] >= round(sum(fitted), 1) > 0
+    assert made["seconds"] >= made["fit"]["seconds"] == round(sum(fitted), 1) > 0
     assert not any(made["effects"][name]["on"] for name in ("motion", "rotation", "background"))
     assert yaml.safe_load((in_tmp / "still" / "config.yaml").read_text())["model"]["motion"] is None
     assert {path.name for path in in_tmp.glob("runs/still/plan-*/*")} == {"still", "plan.yaml"}
     assert "fine: finished before" in forewarp("train", *typed, "effects=auto").out
+
+
+@pytest.fixture(scope="module")
+def specimens(tmp_path_factory):
+    """A folder to write procedural scenes into, on first use."""
+    return tmp_path_factory.mktemp("specimens")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("model", ["particles", "forward"])
+@pytest.mark.parametrize(
+    ("scene", "wanted"),
+    [
+        ("daylight", {"motion", "color_over_time", "view_dependence"}),
+        ("still", set()),
+        ("glossy", {"view_dependence"}),
+    ],
+)
+def test_specimens_get_what_they_call_for(ok, specimens, in_tmp, model, scene, wanted):
+    """However short the budget, and although no silhouettes of theirs disagree."""
+    typed = [f"model={model}", f"scene=specimen_{scene}", f"paths.data={specimens}", "threads=1"]
+    ok("plan", *typed, "trainer=cpu", "budget.minutes=0.01", "plan.folder=plan")
+    effects = yaml.safe_load((in_tmp / "plan" / "plan.yaml").read_text())["effects"]
+    judged = {"particles": {"motion", "color_over_time", "view_dependence"}, "forward": {"motion"}}[model]
+    assert {name for name in judged if effects[name]["on"]} == wanted & judged
 
 
 def test_a_sweep_plans_the_method_of_its_file(ok, scenes, in_tmp):

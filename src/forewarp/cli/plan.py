@@ -1,7 +1,8 @@
 """
 forewarp-plan says which effects a scene calls for, each with the number that decides. It reads the training
-images; where silhouettes stand still it also fits the scene for some seconds without effects, and looks at
-what is left over. What nothing speaks against stays as the preset has it. It never looks at test views.
+images; where silhouettes stand still it also fits the scene without effects for a fixed number of steps, and
+looks at what is left over. The choices depend on no budget or clock; the fit's cost is printed, and comes on
+top of the budget. What nothing speaks against stays as the preset has it. It never looks at test views.
 
   forewarp-plan scene=specimen_glossy                           a synthetic scene that stands still
   forewarp-plan experiment=dnerf data.root=../data/dnerf data.scene=hook
@@ -9,7 +10,7 @@ what is left over. What nothing speaks against stays as the preset has it. It ne
   forewarp-train experiment=dnerf data.root=../data/dnerf data.scene=hook effects=auto     both at once
 
 All overrides of forewarp-train work here too; what is typed is fixed, and not decided by the plan.
-  plan.folder=FOLDER     where plan.yaml and the short fit go
+  plan.folder=FOLDER     where plan.yaml and the still fit go
 Overrule a plan by an override: forewarp-train plan=FILE model/view_dependence=none
 """
 

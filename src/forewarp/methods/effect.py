@@ -36,10 +36,13 @@ class Residual:
 
 @dataclass(frozen=True)
 class Evidence:
-    """What is known of a scene: what its images say and, where silhouettes stand still, a still fit."""
+    """What is known of a scene: what its images say and, where silhouettes stand still, a still fit;
+    ``unfit``: why there is none where one is called for.
+    """
 
     pictures: Survey
     residual: Residual | None = None
+    unfit: str | None = None
 
     @property
     def cut_out(self) -> bool:
@@ -61,8 +64,7 @@ class Evidence:
             return True, f"{why}; without silhouettes, motion is taken for granted"
         why += f"; a static shape explains all but {self.pictures.disagreement:.1%} of the silhouettes"
         if self.residual is None:
-            short = ", and no fit was long enough to tell more: raise budget.minutes"
-            return True, why + (short if self.silhouettes_rest else "")
+            return True, why + (f", and {self.unfit}, so it is left on" if self.unfit else "")
         share = self.residual.by_time
         return share > BY_TIME, f"{why}, and time {max(share, 0):.0%} of what a still fit leaves over"
 

@@ -103,7 +103,8 @@ class Method(nn.Module):
         numbers: its own keys of a stage.
         asks: what a batch should hold.
         effects: its optional parts (see ``methods.effect``).
-        still_steps: steps after which a fit without effects shows what it can't explain, for a plan.
+        still_steps: steps after which a fit without effects shows what it can't explain, for a plan; None:
+            no such fit is made.
         grows: dotted names of the parameters and buffers whose number of rows may change during training;
             they adopt a checkpoint's. A part of it may have a ``grows`` of its own.
         loose: those of them that ``misfit`` itself compares with the others, as they have rows of their own.
@@ -116,7 +117,7 @@ class Method(nn.Module):
     numbers: ClassVar[Sequence[str]] = ()
     asks: Asks = Asks()
     effects: ClassVar[Sequence] = ()
-    still_steps: ClassVar[int] = 150
+    still_steps: ClassVar[int | None] = None
     grows: ClassVar[Sequence[str]] = ()
     loose: ClassVar[Sequence[str]] = ()
     on_cpu: ClassVar[str | None] = None

@@ -103,6 +103,9 @@ def show_plan(made: dict, *, to_fit: bool = True) -> None:
     from forewarp.progress import time_text
 
     title = f"planned {'before, ' if made.get('found') else ''}in {time_text(made['seconds'])}"
+    if fit := made.get("fit"):
+        title += f"; {fit['seconds']:g} s of it for {fit['steps']} steps of a still fit"
+        title += f": {fit['share']:.0%} of the budget, on top of it"
     table = Table(box=box.SIMPLE, title=title, title_justify="left")
     for name in ("effect", "choice", "because"):
         table.add_column(name, overflow="fold")

@@ -134,6 +134,7 @@ class VoxelMethod(Method):
     terms += ("tv_depth", "static_points", "moving_opacity")
     literal = ("photo", "point_color", "background_entropy")  # their printed form differs
     numbers = tuple(field.name for field in fields(VoxelStage) if field.name != "name")
+    still_steps = 150  # a step is of rays of many images
     moves: bool
 
     def __init__(
