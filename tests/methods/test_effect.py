@@ -35,7 +35,7 @@ def on(effects, preset, pictures, typed=None, **residual):
         (replace(QUIET, cut_out=0.0), {}, set(OF_PARTICLES)),  # no silhouettes, no evidence
         (QUIET, {"by_time": -0.05, "by_direction": 0.05}, set()),
         (QUIET, {"by_time": -0.05, "by_direction": 0.2}, {"view_dependence"}),
-        (QUIET, {"by_time": 0.02, "by_direction": 0.05}, set(OF_PARTICLES)),  # a time has few directions
+        (QUIET, {"by_time": 0.03, "by_direction": 0.05}, set(OF_PARTICLES)),  # a time has few directions
     ],
 )
 def test_scenes_that_call_for_different_things_get_different_things(pictures, residual, expected):

@@ -42,9 +42,9 @@ def test_noise_is_explained_by_nothing(seen):
     assert explained(over_time, noise, cells, views) < 0
 
 
-def test_cells_are_a_twentieth_of_the_extent():
+def test_cells_are_a_tenth_of_the_extent():
     places = torch.stack([torch.linspace(0, 2, 401), torch.zeros(401), torch.zeros(401)], -1).double()
-    assert 20 <= int(cells_of(places).max()) + 1 <= 22
+    assert 10 <= int(cells_of(places).max()) + 1 <= 12
 
 
 @pytest.mark.parametrize(("opacity", "tells"), [(0.0, False), (1.0, True)])

@@ -15,15 +15,15 @@ STILL = 0.001
 ENOUGH = 40  # images from which on it counts that nothing is seen to change
 DRIFT_TIMES = 4  # of training for each cosine of a drift of exposure; fewer tell nothing of it
 NARROW = 15.0  # degrees between the most different cameras below which direction cannot be observed
-# Least shares of what a short still fit leaves over that time, and direction, explain. After ``still_steps``
-# time explains -0.10 to -0.04 of scenes that stand still and 0.03 to 0.20 where the light moves: anything at
-# all counts. Direction explains 0.05 to 0.11 of a matte scene and 0.16 to 0.29 of a glossy one.
-BY_TIME, BY_DIRECTION = 0.0, 0.15
+# Least shares of what a still fit leaves over that time, and direction, explain; in the middle of a gap, so that
+# no order of sums decides. Time explains less than nothing of scenes that stand still and 0.12 or more where the
+# light moves; direction up to 0.10 of a matte scene and from 0.20 on of a glossy one (docs/effects.md).
+BY_TIME, BY_DIRECTION = 0.02, 0.15
 
 
 @dataclass(frozen=True)
 class Residual:
-    """Errors that a short still fit of a scene leaves in its training images.
+    """Errors that a still fit of a scene leaves in its training images.
 
     Attributes:
         by_time, by_direction: shares of the squared error that colours changing over time, or with the
