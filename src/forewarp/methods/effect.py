@@ -15,8 +15,8 @@ STILL = 0.001
 ENOUGH = 40  # images from which on it counts that nothing is seen to change
 DRIFT_TIMES = 4  # of training for each cosine of a drift of exposure; fewer tell nothing of it
 NARROW = 15.0  # degrees between the most different cameras below which direction cannot be observed
-# Least shares of what a still fit leaves over that time, and direction, explain; in the middle of a gap, so that
-# no order of sums decides. Time explains less than nothing of scenes that stand still and 0.12 or more where the
+# Least shares of what a still fit leaves over that time, and direction, explain; within a gap, so that no
+# order of sums decides. Time explains less than nothing of scenes that stand still and 0.12 or more where the
 # light moves; direction up to 0.10 of a matte scene and from 0.20 on of a glossy one (docs/effects.md).
 BY_TIME, BY_DIRECTION = 0.02, 0.15
 
