@@ -12,10 +12,15 @@ import secrets
 import shutil
 import stat
 import time
+import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from reprlib import repr as short
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    import numpy as np
 
 # The most bytes that are read of a file.
 MOST_CONFIG = 1 << 20  # of a config or a plan; ours have a few thousand
@@ -256,3 +261,20 @@ def check_size(path: Path, most: int) -> None:
         raise ValueError(f"{path}: expected a file, but got a device or a pipe")
     if about.st_size > most:
         raise ValueError(f"{path}: expected at most {most} bytes, but got {about.st_size}")
+
+
+def unpack_arrays(data: bytes) -> dict[str, np.ndarray]:
+    """Return the arrays of an .npz by name.
+
+    Raises:
+        ValueError: for objects, or arrays that unpack to more than ``MOST_ARRAYS``.
+        zipfile.BadZipFile: for another file.
+    """
+    import numpy as np  # late: commands that only print help need none
+
+    with zipfile.ZipFile(io.BytesIO(data)) as archive:
+        unpacked = sum(part.file_size for part in archive.infolist())
+    if unpacked > MOST_ARRAYS:
+        raise ValueError(f"{unpacked} bytes unpacked")
+    with np.load(io.BytesIO(data), allow_pickle=False) as loaded:
+        return dict(loaded)

@@ -82,7 +82,7 @@ def of_nerf(method):
 
 
 def of_dnerf(method):
-    return {"offset": method.offset(POINTS, 0.5)} | {
+    return {"offset": method.backward_flow(POINTS, 0.5)} | {
         f"{time}": along(method, time, 1.0)[1]["rgb"] for time in (0.0, 0.5)
     }
 

@@ -280,8 +280,8 @@ def test_the_content_of_dnerf_moves_against_its_offset():
 def test_continuous_offsets_go_to_zero_at_the_canonical_time():
     jumps, glides = (skipping("dnerf", continuous=continuous) for continuous in (False, True))
     points = torch.randn(64, 3)
-    assert float(glides.offset(points, 1e-5).detach().abs().max()) < 1e-4
-    assert float(jumps.offset(points, 1e-5).detach().abs().mean()) > 1e-3
+    assert float(glides.backward_flow(points, 1e-5).detach().abs().max()) < 1e-4
+    assert float(jumps.backward_flow(points, 1e-5).detach().abs().mean()) > 1e-3
 
 
 def test_the_second_time_is_a_neighbours_side_and_offsets_are_summed():
@@ -291,7 +291,7 @@ def test_the_second_time_is_a_neighbours_side_and_offsets_are_summed():
         asked.append(time)
         return time * torch.ones_like(points)
 
-    made.offset = offset
+    made.backward_flow = offset
     seen, generator = SimpleNamespace(points=torch.zeros(7, 4, 3)), draw()
     for time, low, high in ((0.0, 0.0, 0.5), (0.5, 0.0, 1.0), (1.0, 0.5, 1.0)):
         term, between = made.extra_terms(seen, batch(time), generator)["second_time"], []

@@ -3,7 +3,7 @@ import math
 import pytest
 import torch
 
-from forewarp.metrics.geometry import depth_delta, end_point_error
+from forewarp.metrics.geometry import chamfer, depth_delta, end_point_error, variation
 from forewarp.metrics.registry import THRESHOLDS
 from tests.support import reference
 
@@ -105,3 +105,27 @@ def test_end_point_refusals():
     ):
         with pytest.raises(ValueError, match=match):
             end_point_error(points, true)
+
+
+def test_chamfer_by_hand():
+    predicted = torch.tensor([[0.0, 0, 0], [4.0, 0, 0]])
+    truth = torch.tensor([[0.0, 3, 0], [4.0, 0, 0], [4.0, 0, 1]])
+    # To the truth 3 and 0; from it 3, 0 and 1.
+    found = chamfer(predicted, truth)
+    assert found == pytest.approx({"accuracy": 1.5, "completeness": 4 / 3, "chamfer": (1.5 + 4 / 3) / 2})
+    assert chamfer(predicted, truth[:0]) is None
+    assert chamfer(truth, truth)["chamfer"] == 0
+
+
+@pytest.mark.parametrize(
+    ("values", "expected"),
+    [
+        ([1.0, 2.0, 5.0], 1.0),
+        ([0.0, 2.0, 0.0, 2.0], 3.0),
+        ([3.0, 1.0, 2.0], 1.5),
+        ([2.0, 2.0], None),
+        ([1.0], None),
+    ],
+)
+def test_variation_by_hand(values, expected):
+    assert variation(values) == expected

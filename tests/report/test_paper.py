@@ -183,11 +183,11 @@ def test_pages_tell_how_numbers_came_about(whole):
         assert f"| forewarp: {method} | {kind} | measured |" in lines
     assert "| Ours (80^3) | PC | published | 32.68 | 0.97 | 0.04 |" in lines
     names = {path.name for path in whole.glob("paper-*.png")}
-    assert names == {"paper-resolution.png", "paper-canonical-hook.png", "paper-views-dnerf-hook.png"}
+    assert names == {"paper-resolution.png", "paper-views-dnerf-hook.png"}
     assert "# machine: a cpu, 2 threads" in (whole / "paper-table-1-d-nerf.csv").read_text()
     page = (whole / "paper.html").read_text()  # needs nothing else
     sources = [source.split(",") for source in re.findall(r'src="([^"]*)"', page)]
-    assert [kind for kind, _ in sources] == ["data:image/png;base64"] * 4
+    assert [kind for kind, _ in sources] == ["data:image/png;base64"] * 3
     assert all(base64.b64decode(content).startswith(b"\x89PNG") for _, content in sources)
     assert not re.search(r"https?://|<script|<link", page)
     assert "<td class=n>30.00" in page

@@ -63,7 +63,7 @@ OF_FORWARD = [*ABLATIONS, "resolution"]
 LANES = (
     "methods:dnerf nhr:nhr ablation_losses:dnerf ablation_modules:dnerf",
     "methods:hypernerf lego_complete:lego_complete ablation_modules:hypernerf "
-    "ablation_modules:lego_complete resolution:hypernerf",
+    "ablation_modules:lego_complete resolution:hypernerf flow:drive",
 )
 # The voxel networks come with the fine stage, to which the demo's numbers give too little of the training; on
 # fewer rays and voxels it makes enough steps within minutes.
@@ -78,9 +78,10 @@ FEW = {
     "dnerf": "data.synthesis.size=64 data.synthesis.frames=16 data.synthesis.test_views=[2,2,2]",
     "hypernerf": "data.synthesis.frames=9",
     "nhr": "data.synthesis.size=96 data.synthesis.frames=6",
-    "lego_complete": "data.synthesis.size=64 data.synthesis.frames=8 data.synthesis.motions=[lift_tilt] "
-    "data.synthesis.test_views=[1,2,4]",
+    "lego_complete": "data.synthesis.size=64 data.synthesis.frames=8 data.synthesis.test_views=[1,2,4] "
+    "data.synthesis.motions=[lift_tilt,drive]",
 }
+FEW["drive"] = FEW["lego_complete"]  # of one folder
 TINY = shlex.split(
     "data.scene=tiny paths.data=runs/bench-gpu data.synthesis.size=32 data.synthesis.frames=8 "
     "data.synthesis.test_views=[1,1,1] preset.rays=64 preset.inpainter_width=16 data.held_out=2 "
@@ -235,7 +236,7 @@ def _until(minutes: str | None = None, steps: str | None = None) -> Sweep:
 
 def _models(methods: str, sweep: str) -> Sweep:
     """Return the override that names methods in place of a sweep's own, where a sweep is of any method."""
-    if not methods or sweep in OF_FORWARD:
+    if not methods or sweep in (*OF_FORWARD, "flow"):
         return []
     if methods == "all":
         content = yaml.safe_load((project_root() / "sweeps" / "methods.yaml").read_text())
@@ -247,7 +248,7 @@ def _counterparts(sweeps: str, base: Sweep, keys: Keys) -> list[list[Sweep]]:
     """Return the sweeps of counterparts in two lanes: the tables', those of ``ablations``, or ``all``, which
     together draw every figure.
     """
-    left_out = {"": OF_FORWARD, "ablations": [*TABLES, "methods", "resolution"], "all": []}
+    left_out = {"": OF_FORWARD, "ablations": [*TABLES, "methods", "resolution", "flow"], "all": []}
     base = [*base, "budget.clock=processor", "threads=1"]
 
     def of_pair(sweep: str, data: str) -> Sweep:

@@ -13,7 +13,7 @@ from torch import Tensor
 from forewarp.data.cameras import MOST_UNITS
 from forewarp.data.files import mismatch, numbers_of, opened, read_bytes
 from forewarp.data.images import read_gray16
-from forewarp.files import MOST_ARRAYS, MOST_POINTS, written_whole
+from forewarp.files import MOST_ARRAYS, MOST_POINTS, unpack_arrays, written_whole
 from forewarp.ops.grid import reduced_depth
 from forewarp.scene.frame import Truth
 
@@ -172,13 +172,8 @@ def load_numpy(path: Path) -> np.ndarray | dict[str, np.ndarray]:
     with opened(path, MOST_ARRAYS, "a NumPy file") as stream:
         try:
             if zipfile.is_zipfile(stream):
-                with zipfile.ZipFile(stream) as archive:
-                    unpacked = sum(part.file_size for part in archive.infolist())
-                if unpacked > MOST_ARRAYS:
-                    raise ValueError(f"{unpacked} bytes unpacked")
                 stream.seek(0)
-                with np.load(stream, allow_pickle=False) as loaded:
-                    return dict(loaded)
+                return unpack_arrays(stream.read())
             # Mapped, so that a header that declares more than the file holds is refused without allocation.
             # np.load would leave a file open that begins as an archive and is none.
             return np.lib.format.open_memmap(path, mode="r")

@@ -18,6 +18,7 @@ from torch import Tensor
 
 from forewarp.clock import now
 from forewarp.drawing.images import at_least, depth_colors, depth_ends, error_colors, in_a_row, write_png
+from forewarp.evaluation.motion import measure_motion
 from forewarp.files import write_json
 from forewarp.methods.effect import switched
 from forewarp.methods.method import CarriesPixels, HasEllipsoids, HasLayers, HasTrajectories, parameter_count
@@ -100,7 +101,8 @@ def evaluate(
 
     Write ``images/<name>.png`` (the best rendering), for some views ``images/sheets/<name>.png`` (truth |
     prediction | error) and the same of depth, ``images/depth/<name>.png``, where it is known,
-    ``per_image.json``, ``networks.json`` if the method has any to draw, and last ``metrics.json``.
+    ``per_image.json``, with sheets ``motion.npz``, ``networks.json`` if the method has any to draw, and last
+    ``metrics.json``.
 
     Args:
         module: the fitted scene, on the device to use.
@@ -172,6 +174,7 @@ def evaluate(
     for name, of_motion in (("flow", flow_error), ("keypoints", keypoint_transfer)):
         if (found := of_motion(module, scene)) is not None:
             metrics[name] = found
+    metrics |= measure_motion(module, datamodule, folder, pictures=sheets > 0)
     write_json(folder / "per_image.json", {"images": per_image})
     if networks := module.method.outlines():
         write_json(folder / "networks.json", networks)

@@ -39,8 +39,8 @@ class DNeRF(SampledMethod):
         self.offset_head = nn.Linear(self.shape["width"], 3)
         self.template = Template(*self.sizes, **self.shape)
 
-    def offset(self, points: Tensor, time: float) -> Tensor:
-        """How far points (..., 3) are from their canonical places at a time (..., 3), world units."""
+    def backward_flow(self, points: Tensor, time: float) -> Tensor:
+        """See ``HasBackwardFlow``; of points (..., 3)."""
         if time == self.canonical_time:
             return torch.zeros_like(points)
         offset = self._raw_offset(points, time)
@@ -54,7 +54,7 @@ class DNeRF(SampledMethod):
         """See ``SampledMethod``."""
 
         def encoded(points: Tensor) -> Tensor:
-            return self.position(points + self.offset(points, moment.time))
+            return self.position(points + self.backward_flow(points, moment.time))
 
         return None, Field(self.template, self.activation, encoded, self.direction)
 
@@ -70,7 +70,11 @@ class DNeRF(SampledMethod):
             drawn = torch.rand(2, generator=generator).tolist()
             neighbour = beside[int(drawn[0] * len(beside))] if beside else time
             between = time + drawn[1] * (neighbour - time)
-            return (self.offset(seen.points, time) - self.offset(seen.points, between)).square().sum()
+            return (
+                (self.backward_flow(seen.points, time) - self.backward_flow(seen.points, between))
+                .square()
+                .sum()
+            )
 
         return {"second_time": second_time}
 

@@ -296,6 +296,14 @@ class HasTrajectories(Protocol):
 
 
 @runtime_checkable
+class HasBackwardFlow(Protocol):
+    """Say of every place, at any time, where what is there was at the canonical time."""
+
+    def backward_flow(self, points: Tensor, time: float) -> Tensor:
+        """Return the way (N, 3) from places (N, 3) at a time in [0, 1] to the canonical ones, world units."""
+
+
+@runtime_checkable
 class CarriesPixels(Protocol):
     """Follow what an image shows through time."""
 

@@ -176,6 +176,10 @@ class NDVG(MarchedMethod):
         found = self.network(torch.cat(encoded, -1))
         return found[:, :3], found[:, 3]
 
+    def backward_flow(self, points: Tensor, time: float) -> Tensor:
+        """See ``HasBackwardFlow``."""
+        return self.field(Moment(time)).offset(points)[0]
+
     def density_found(self, points: Tensor, time: float) -> Tensor:
         """As ``density_at``; 0 without a look in cells that were found to be empty."""
         if self.occupancy is None:

@@ -1,7 +1,10 @@
-"""Accuracy of geometry: depth maps and point trajectories."""
+"""Accuracy of geometry: depth maps, shapes and point trajectories; how unsteady a curve is."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -103,6 +106,45 @@ def end_point_error(
         "count_still": int((~moving).sum()),
         "moving_threshold": float(moving_threshold),
     }
+
+
+def chamfer(predicted: Tensor, truth: Tensor) -> dict[str, float] | None:
+    r"""Compare two surfaces given as points, in world units.
+
+    .. math:: \mathrm{chamfer} = \tfrac12 \Big( \underbrace{\tfrac1{|P|} \sum_{p \in P} \min_{q \in Q}
+        |p - q|}_{\text{accuracy}} + \underbrace{\tfrac1{|Q|} \sum_{q \in Q} \min_{p \in P}
+        |p - q|}_{\text{completeness}} \Big)
+
+    Args:
+        predicted: points P (N, 3).
+        truth: points Q (M, 3).
+
+    Returns:
+        ``chamfer``, ``accuracy``, ``completeness``; None if a surface has no points.
+
+    >>> chamfer(torch.zeros(1, 3), torch.tensor([[0.0, 0, 0], [0, 0, 3]]))
+    {'chamfer': 0.75, 'accuracy': 0.0, 'completeness': 1.5}
+    """
+    from scipy.spatial import cKDTree  # late, as its import takes time
+
+    points = [given.detach().cpu().double().numpy() for given in (predicted, truth)]
+    if not all(map(len, points)):
+        return None
+    trees = [cKDTree(given) for given in points]
+    accuracy, completeness = (float(trees[1 - i].query(points[i])[0].mean()) for i in (0, 1))
+    return {"chamfer": (accuracy + completeness) / 2, "accuracy": accuracy, "completeness": completeness}
+
+
+def variation(values: Sequence[float]) -> float | None:
+    """Divide the total variation of a curve by its range: 1 where it only rises or only falls, more the more
+    often it jumps to and fro; None of a constant, or of fewer than two values.
+
+    >>> variation([0.0, 1.0, 4.0]), variation([0.0, 4.0, 1.0, 4.0])
+    (1.0, 2.5)
+    """
+    values = np.asarray(values, np.float64)
+    extent = float(np.ptp(values)) if len(values) > 1 else 0.0
+    return float(np.abs(np.diff(values)).sum()) / extent if extent > 0 else None
 
 
 def _mean(values: Tensor) -> float | None:

@@ -20,7 +20,7 @@ import yaml
 
 from forewarp.files import MOST_CONFIG, read_json, read_text, replace_file
 from forewarp.metrics.registry import metric_of
-from forewarp.report import figures
+from forewarp.report import figures, motion_figures
 from forewarp.report.results import KINDS, Point, Row, Runs, nothing, refused
 from forewarp.report.settings import grouped
 from forewarp.report.statistics import INTERVALS, LEAST, Estimate, by_chance, rank, verdict
@@ -33,7 +33,6 @@ BUDGET = "preset", "minutes", "iterations", "held_out", "train_views", "device",
 BUDGET += ("image_format",)
 ROW = ("ablation", "method", "setting", *BUDGET)
 UNPRINTED = ("particles", "backward")  # methods of this project that the paper prints no row of
-METHODS = ("particles", "forward", "backward")  # that are compared in pictures of the canonical time
 DATASETS = ("dnerf", "hypernerf", "nhr", "lego_complete")
 NO_TYPE = "–"
 TYPES = "Type: N without a canonical space, PC with a physical one (flow is 0 at the canonical time), NPC "
@@ -396,14 +395,13 @@ def write_paper(
         left_out.append(f"no measured row: {', '.join(absent)}")
     for section, file in zip(tables, files):
         replace_file(file, section.tables[0].csv() + "".join(f"# {line}\n" for line in section.facts))
-    drawn = _figures(paper, runs, out, curves)
+    drawn, figure_files = _figures(paper, runs, out, curves)
     sections = [*tables, *drawn, _about(tables, used, numbers)]
     sections += [Section("Left out", facts=left_out)] if left_out else []
     for kind in ("md", "html", "tex"):
         parts = {"sections": sections, "tables": tables, "figures": drawn}
         replace_file(out / f"paper.{kind}", rendered(f"paper.{kind}.j2", **parts))
-    own = [path for section in drawn for path in section.pictures if path.name.startswith("paper-")]
-    return [*(out / f"paper.{kind}" for kind in ("md", "html", "tex")), *files, *own]
+    return [*(out / f"paper.{kind}" for kind in ("md", "html", "tex")), *files, *figure_files]
 
 
 def _read(folder: Path, tables: Iterable[PaperTable]) -> tuple[Runs, list[str]]:
@@ -450,23 +448,31 @@ def budget_of(run: Row, each: str = "", by_processor: str = "") -> list[str]:
     return [run["preset"], *minutes, *([f"{run['iterations']} steps"] if run["iterations"] else [])]
 
 
-def _figures(paper: Iterable[PaperTable], runs: Runs, out: Path, curves: Path | None) -> list[Section]:
-    """Draw what these runs allow, and add the pictures in ``curves``; say if matplotlib is missing."""
+def _figures(
+    paper: Iterable[PaperTable], runs: Runs, out: Path, curves: Path | None
+) -> tuple[list[Section], list[Path]]:
+    """Draw what these runs allow, and add the pictures in ``curves``; say if matplotlib is missing.
+
+    Also return the files written, without those copied.
+    """
     runs = Runs(run for run in runs if run["folder"].is_dir())  # rows of a CSV file have no pictures
     plain = runs.where(ablation=None)
     try:
+        sections, files = motion_figures.sections_of(runs, out)
         found = _views(paper, plain, out), _ablations(paper, runs, out), _resolutions(runs, out)
-        sections = [*_canonical(plain, out), *chain(*found), *_networks(runs, out)]
+        others = [*chain(*found), *_networks(runs, out)]
     except ImportError as error:
-        return [Section("Figures", facts=[str(error)])]
-    sections = [section for section in sections if None not in section.pictures]
+        return [Section("Figures", facts=[str(error)])], []
+    others = [section for section in others if None not in section.pictures]
+    files += [path for section in others for path in section.pictures]
+    sections += others
     for path in sorted(curves.glob("accuracy-time-*.png")) if curves is not None else ():
         if path.parent.resolve() != out.resolve():
             replace_file(out / path.name, path.read_bytes())
     if pictures := sorted(out.glob("accuracy-time-*.png")):
         told = "Separate runs, with views held out, of forewarp-report kind=accuracy_time."
         sections.append(Section("Accuracy against training time", pictures=pictures, caption=told))
-    return sections
+    return sections, files
 
 
 def _rivals(runs: Runs, name: str, order: Iterable[str]) -> dict[str, Row]:
@@ -490,19 +496,6 @@ def _rivals(runs: Runs, name: str, order: Iterable[str]) -> dict[str, Row]:
 def _file(out: Path, *words: object) -> Path:
     """Name a picture; what could not stand in LaTeX or a link becomes a hyphen."""
     return out / f"paper-{'-'.join(re.sub(r'[^A-Za-z0-9_-]+', '-', str(word)) for word in words)}.png"
-
-
-def _canonical(plain: Runs, out: Path) -> Iterator[Section]:
-    """Draw, of each scene, the test view nearest to the canonical time."""
-    for scene, of_scene in plain.where(method=METHODS).by("scene").items():
-        if len(rivals := _rivals(of_scene, "method", METHODS)) > 1:
-            first = next(iter(rivals.values()))
-            usual = 0.5 if first["origin"] == "hypernerf" else 0.0
-            at = first["metrics"]["protocol"].get("canonical_time", usual)
-            words = f"{scene}, near the canonical time"
-            drawn = figures.draw_beside(_file(out, "canonical", scene), rivals, at, words)
-            caption = "The test view nearest to the canonical time, and the error below it."
-            yield Section(f"Canonical comparison: {scene}", pictures=[drawn], caption=caption)
 
 
 def _views(paper: Iterable[PaperTable], plain: Runs, out: Path) -> Iterator[Section]:

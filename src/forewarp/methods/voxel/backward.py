@@ -146,6 +146,8 @@ class BackwardWarp(VoxelMethod):
             paths.append(at)
         return torch.stack(paths, 1)
 
-    def displacement(self, points: Tensor, time: float) -> Tensor:
-        """Return the displacement (N, 3) of points at ``time`` to the canonical time; differentiable."""
-        return self.deformation(points, time)
+    def backward_flow(self, points: Tensor, time: float) -> Tensor:
+        """See ``HasBackwardFlow``; differentiable."""
+        return torch.zeros_like(points) if self.deformation is None else self.deformation(points, time)
+
+    displacement = backward_flow  # that of points which never move is to be 0 either way
