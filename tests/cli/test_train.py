@@ -5,6 +5,7 @@ import os
 import shutil
 from importlib.metadata import version
 
+import imageio.v3 as iio
 import lightning
 import pytest
 import torch
@@ -119,7 +120,17 @@ def test_trackers_get_a_name_for_each_thing(fitted):
     assert found == pytest.approx(expected, rel=1e-6)
     assert {last[name].step for name in expected} == {sum(content["steps"].values())}
     named = {name.split("/")[0] for name in last}
-    assert named == {"train", "lr", "val", "curve", "test"}
+    assert named == {"train", "lr", "grad_norm", "val", "curve", "test"}
+    groups = [
+        {name.split("/")[1] for name in last if name.startswith(kind)} for kind in ("lr/", "grad_norm/")
+    ]
+    assert groups[0] == groups[1] >= {"density", "color", "flow"}
+    (text,) = events.Tensors("config/text_summary")
+    assert (fitted / "config.yaml").read_text() in text.tensor_proto.string_val[0].decode()
+    (film,) = events.Images("film/test")
+    assert (film.step, film.width, film.height) == (sum(content["steps"].values()), 32, 32)
+    assert film.encoded_image_string == (fitted / "videos" / "test.gif").read_bytes()
+    assert 4 <= len(iio.imread(film.encoded_image_string, extension=".gif")) <= 30
 
 
 @pytest.mark.slow

@@ -4,6 +4,7 @@ from functools import partial
 
 import lightning
 import pytest
+import torch
 from lightning.pytorch.loggers import TensorBoardLogger
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
@@ -11,7 +12,7 @@ from forewarp.clock import Clock
 from forewarp.data.module import SceneDataModule
 from forewarp.evaluation.images import TrainingImages
 from forewarp.progress import ProgressLine
-from forewarp.training.callbacks import Scalars, StageProgress
+from forewarp.training.callbacks import Scalars, StageProgress, gradient_norms
 from forewarp.training.loggers import RunLoggers
 from tests.support.tiny_scene import Interrupt, ball_data, ball_scene, make_run, same, stage
 
@@ -94,6 +95,31 @@ def test_every_named_curve_is_there_and_a_mean_over_the_steps_between(watched):
     assert files == sorted(f"{moment}_{name}.png" for moment in ("025", "050", "100") for name in names)
     for name in names:
         assert [image.step for image in events.Images(f"images/{name}")] == [3, 6, 12]
+
+
+def test_gradients_are_measured_where_steps_are_logged_before_they_are_clipped(tmp_path, monkeypatch):
+    measured, first = [], torch.nn.Parameter(torch.zeros(2))
+    first.grad = torch.tensor([3.0, 4.0])
+    second, third = torch.nn.Parameter(torch.zeros(1)), torch.nn.Parameter(torch.zeros(1))
+    second.grad = torch.tensor([12.0])
+    groups = [{"name": "a", "params": [first, second, third]}, {"name": "b", "params": [third]}]
+    assert gradient_norms(groups) == {"a": 13.0}
+
+    def note(groups):
+        measured.append([group["name"] for group in groups])
+        return {"density": 7.0}
+
+    monkeypatch.setattr("forewarp.training.callbacks.gradient_norms", note)
+    watched_run(tmp_path, Scalars(every=5, lr=False)).fit()
+    events = events_of(tmp_path)
+    assert len(measured) == STEPS // 5
+    assert [(point.step, point.value) for point in events.Scalars("grad_norm/density")] == [
+        (5, 7.0),
+        (10, 7.0),
+    ]
+    assert not [name for name in events.Tags()["scalars"] if name.startswith("lr/")]
+    Scalars(every=1, grad_norm=False).on_before_optimizer_step(None, None, None)
+    assert len(measured) == STEPS // 5
 
 
 def test_without_validation_views_there_is_no_validation_curve(tmp_path):

@@ -8,9 +8,10 @@ import torch
 from lightning.pytorch.loggers import MLFlowLogger, TensorBoardLogger, WandbLogger
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+from forewarp.drawing.images import write_video
 from forewarp.files import read_json, read_rows
 from forewarp.training.callbacks import Scalars
-from forewarp.training.loggers import CsvLogger, RunLoggers
+from forewarp.training.loggers import CsvLogger, Labels, RunLoggers
 from tests.support.tiny_scene import Interrupt, make_run, stage
 
 STEPS = 6
@@ -34,13 +35,18 @@ class Note(lightning.Callback):
 
 def logged(folder, makers, *callbacks):
     """Train two stages of six steps with loggers, and log the scores of the run."""
-    loggers = RunLoggers(makers, folder / "run", folder, lambda: PARAMETERS)
+    labels = Labels("ball", "minutes", ("pilot", "two"), True)
+    (folder / "run").mkdir(exist_ok=True)
+    (folder / "run" / "config.yaml").write_text("seed: 7\n")
+    write_video(folder / "test.gif", [torch.rand(8, 10, 3) for _ in range(3)], fps=8)
+    loggers = RunLoggers(makers, folder / "run", folder, lambda: PARAMETERS, labels)
     stages = [stage(name, iterations=STEPS) for name in ("coarse", "fine")]
     own = [Scalars(every=2), *callbacks]
     with loggers:
         module = make_run(folder / "run", stages, callbacks=own, loggers=loggers).fit()
         loggers.log_image("images/last", torch.rand(8, 8, 3), module.global_step)
         loggers.log_scores(SCORES, 2 * STEPS)
+        loggers.log_film("film/test", folder / "test.gif", 2 * STEPS)
 
 
 def interrupted_and_continued(folder, makers):
@@ -83,7 +89,11 @@ def test_stages_are_one_curve_and_a_continued_run_goes_on_in_it(tmp_path, plain)
     events.Reload()
     assert [point.step for point in events.Scalars("train/loss")] == steps
     assert [(point.step, point.value) for point in events.Scalars("test/all/psnr")] == [(12, 30.5)]
-    assert events.Tags()["images"] == ["images/last"]
+    assert events.Tags()["images"] == ["images/last", "film/test"]
+    (film,) = events.Images("film/test")
+    assert (film.step, film.width, film.height) == (12, 10, 8)
+    assert film.encoded_image_string == (tmp_path / "test.gif").read_bytes()
+    assert b"seed: 7" in events.Tensors("config/text_summary")[0].tensor_proto.string_val[0]
     (table,) = (events.SummaryMetadata("_hparams_/session_start_info").plugin_data.content,)
     assert b"stage.fine.density" in table
 
@@ -147,16 +157,23 @@ def test_mlflow_has_one_run_with_parameters_curves_and_scores(tmp_path, plain):
     assert run.info.run_name.endswith("/run")
     assert run.data.params["stage.fine.density"] == "45.0"
     assert run.data.metrics["test/all/psnr"] == 30.5
+    assert {"sweep": "minutes", "pilot": "true", "two": "true"}.items() <= run.data.tags.items()
+    assert {one.path for one in client.list_artifacts(run.info.run_id)} >= {"config.yaml", "film"}
     steps = {point.step for point in client.get_metric_history(run.info.run_id, "train/loss")}
     assert steps == {2, 4, 6, 8, 10, 12}
 
 
 @pytest.mark.slow
 def test_wandb_has_one_run_for_a_continued_one(tmp_path, monkeypatch):
-    pytest.importorskip("wandb", reason="needs forewarp[trackers]")
+    wandb = pytest.importorskip("wandb", reason="needs forewarp[trackers]")
     monkeypatch.setenv("WANDB_SILENT", "true")
-    makers = {"wandb": partial(WandbLogger, project="forewarp", offline=True)}
+    began, init = [], wandb.init
+    monkeypatch.setattr(wandb, "init", lambda **options: began.append(options) or init(**options))
+    makers = {"wandb": partial(WandbLogger, project="forewarp", offline=True, group=None)}
     interrupted_and_continued(tmp_path, makers)
+    assert [(one["group"], one["tags"]) for one in began] == [("minutes", ["pilot", "two"])] * 2
+    media = {path.suffix for path in (tmp_path / "wandb").glob("offline-run-*/files/media/**/*")}
+    assert {".gif", ".png", ".json"} <= media  # the film, images, the config as a table
     name = read_json(tmp_path / "run" / "loggers.json")["wandb"]
     parts = sorted(path.name for path in (tmp_path / "wandb").glob("offline-run-*"))
     assert len(parts) == 2  # which wandb sync joins, as both are of one run

@@ -37,6 +37,7 @@ What one types most (beside options such as --multirun or --config-dir=FOLDER):
   dataset=dnerf data.scene=hook       a scene of a dataset below paths.scenes=FOLDER, here FOLDER/dnerf/hook
   ablation=NAME                       an ablation of the paper; ablation=full is its whole method
   logger=tensorboard|csv|wandb|mlflow|none   where curves and scores go; several: logger=[tensorboard,mlflow]
+  trackers.film=false                 also .config, .lr, .grad_norm: what else they get; trackers.tags=[pilot]
   windows=N                           a long film in N parts that share what stands still, one after another,
                                       or at once with launcher=joblib; the same as windows=still, then =each
   launcher=local|joblib|ray|slurm|submitit   where the jobs of --multirun run
@@ -89,11 +90,14 @@ def measure(prepared, module) -> float | None:
     from forewarp.evaluation.evaluate import notes_of
     from forewarp.report.figures import draw_own
     from forewarp.runs.build import PROFILE
-    from forewarp.runs.fitted import doubts_of, log_scores, measure_run, tell, training_psnr
+    from forewarp.runs.fitted import doubts_of, log_film, log_scores, measure_run, tell, training_psnr
 
     run, config = prepared.run, prepared.config
     if config.evaluate:
-        log_scores(run, measure_run(run, module, config))
+        metrics = measure_run(run, module, config)
+        log_scores(run, metrics)
+        if (config.get("trackers") or {}).get("film"):
+            log_film(run, module, metrics)
     else:
         fitted = f"fitted: {run.folder}; measure it with forewarp-evaluate {quote(f'run={run.folder}')}"
         print(fitted, *notes_of(module.method.protocol()), sep="\n")

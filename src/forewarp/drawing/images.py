@@ -251,6 +251,11 @@ def jpeg_bytes(image: Tensor, quality: int) -> bytes:
     return iio.imwrite("<bytes>", to_bytes(image), extension=".jpg", quality=quality, subsampling=0)
 
 
+def image_size(path: Path) -> tuple[int, int]:
+    """Read the width and height of an image, or of the first one of a film, in pixels."""
+    return tuple(iio.improps(path, index=0).shape[1::-1])
+
+
 def read_image(path: Path) -> Tensor:
     """Read an image as (H, W, 3) in [0, 1]; alpha is dropped."""
     return torch.from_numpy(iio.imread(path)[..., :3].copy()).float() / 255

@@ -20,6 +20,7 @@ from forewarp.drawing.images import (
 )
 from forewarp.methods.method import HasTrajectories, Method, Snapshot
 from forewarp.scene.camera import Camera, focus_point, mean_up, orbit, swing
+from forewarp.scene.frame import Frame, spread
 from forewarp.scene.view import Moment, Rendering, Target, View
 from forewarp.training.module import DynamicSceneModule
 
@@ -137,6 +138,24 @@ def make_shots(path: str, frames: int, time: float, camera: Camera, cameras: Seq
         about = focus_point(cameras), mean_up(cameras)
         views = swing(camera, cameras, *about, turns) if path == "swing" else orbit(camera, *about, turns)
     return list(zip(views, [time] * frames if path == "orbit" else times))
+
+
+def shots_of_views(frames: Sequence[Frame], count: int, size: int) -> list[Shot]:
+    """Return camera and time of at most ``count`` images, ``size`` pixels along the longer side, of a film of
+    test views.
+
+    They are the views in the order of their times where these are a path: no two at one time, and from one to
+    the next less than half as far as between any two, in the mean. Else the first camera, through time.
+    """
+    ordered = sorted(frames, key=lambda frame: frame.time)
+    if len({frame.time for frame in ordered}) == len(ordered) > 2:
+        centers = torch.stack([frame.camera.center.double() for frame in ordered])
+        step = (centers[1:] - centers[:-1]).norm(dim=-1).mean()
+        if step <= torch.pdist(centers).mean() / 2:
+            chosen = [ordered[i] for i in spread(len(ordered), min(count, len(ordered)))]
+            return [(within(frame.camera, size), frame.time) for frame in chosen]
+    camera = within(frames[0].camera, size)
+    return make_shots("fixed", count, 0.0, camera, [camera])
 
 
 def video(

@@ -21,12 +21,12 @@ from forewarp.clock import Clock
 from forewarp.data.files import mismatch, one_of, whole
 from forewarp.data.films import FOLDER
 from forewarp.provenance import RESULTS
-from forewarp.runs.config import IDENTITY, instead_of, plain, saved_config, trust_of
-from forewarp.runs.overrides import TEXTS, key_of
+from forewarp.runs.config import IDENTITY, instead_of, is_swept, plain, saved_config, trust_of
+from forewarp.runs.overrides import TEXTS, constant, key_of, typed_overrides
 from forewarp.scene.cloud import Handover
 from forewarp.training.callbacks import StageProgress
 from forewarp.training.checkpoints import load_handover
-from forewarp.training.loggers import RunLoggers
+from forewarp.training.loggers import Labels, RunLoggers
 from forewarp.training.module import DynamicSceneModule
 from forewarp.training.schedule import StagePlan, seconds_after, share_out
 from forewarp.training.stages import Run
@@ -137,7 +137,26 @@ def loggers_of(config: DictConfig) -> RunLoggers:
         raise mismatch("logger", expected, "one without", "write its keys below a name")
     makers = instantiate(named, _convert_="all")
     runs = OmegaConf.select(config, "paths.runs") or Path(config.run).parent
-    return RunLoggers(makers, Path(config.run), Path(runs), partial(hyperparameters, config))
+    own = config.get("trackers") or {}
+    labels = Labels(
+        config.data.get("scene"), sweep_of(), tuple(own.get("tags") or ()), own.get("config", False)
+    )
+    return RunLoggers(makers, Path(config.run), Path(runs), partial(hyperparameters, config), labels)
+
+
+def sweep_of() -> str | None:
+    """Name the sweep that this is a job of: ``sweeps=``, else the folder of a typed ``hydra.sweep.dir``, else
+    the keys that jobs differ in; None where it is none, or only seeds differ.
+    """
+    if not is_swept():
+        return None
+    hydra = HydraConfig.get()
+    if "hydra.sweep.dir" in map(key_of, hydra.overrides.hydra):
+        name = Path(hydra.sweep.dir).name
+    else:
+        own = [key for key in map(key_of, typed_overrides()) if key not in {*constant, "seed"}]
+        name = ",".join(dict.fromkeys(own))
+    return hydra.runtime.choices.get("sweeps") or name or None
 
 
 def packages_of(config: DictConfig) -> list[str]:
@@ -165,6 +184,8 @@ def hyperparameters(config: DictConfig) -> dict[str, object]:
     found: dict[str, object] = {"command": shlex.join(words)} if words else {}
     if HydraConfig.initialized() and (sweep := HydraConfig.get().runtime.choices.get("sweeps")):
         found["sweeps"] = sweep
+    if tags := (config.get("trackers") or {}).get("tags"):
+        found["trackers.tags"] = json.dumps(plain(tags))
     unresolved = OmegaConf.to_container(config)
 
     def walk(value: object, name: str) -> None:

@@ -19,7 +19,9 @@ from torch import Tensor
 from forewarp.data.batches import COLORS, color_of
 from forewarp.data.checks import blind_frames, bounds
 from forewarp.data.files import mismatch, one_of
+from forewarp.drawing.images import write_video
 from forewarp.evaluation.evaluate import evaluate, mean_scores, show
+from forewarp.evaluation.images import shots_of_views, video
 from forewarp.fields.moving import MovingGaussians
 from forewarp.fields.windows import MovingWindows
 from forewarp.files import read_json, write_json
@@ -40,6 +42,7 @@ from forewarp.scene.view import Moment, Rendering, View
 from forewarp.training.module import DynamicSceneModule
 from forewarp.training.stages import Run
 
+_FILM_SIZE, _FILM_LEAST, _FILM_MOST, _FILM_RATE = 200, 4, 30, 8.0  # pixels, images, images a second
 SPLITS = ("train", "val", "test", "held")
 _ROUGH = 1e-3  # by which a pose's axes may miss unit length and right angles
 
@@ -296,6 +299,26 @@ def measure_run(run: Run, module: DynamicSceneModule, config: DictConfig) -> dic
 def log_scores(run: Run, metrics: dict) -> None:
     """Log what ``metrics.json`` says of a run to its loggers; see ``scores_to_log``."""
     run.loggers.log_scores(scores_to_log(metrics), sum(done["steps"] for done in run.finished().values()))
+
+
+def log_film(run: Run, module: DynamicSceneModule, metrics: dict) -> None:
+    """Make a small film of the test views, ``videos/test.gif``, and log it, if a logger takes films.
+
+    It is left out where there are no test views, and shorter where it would take long: at most 2 s and a
+    twentieth of the training, as test views took.
+    """
+    targets = run.datamodule.targets("test")
+    if not len(targets.frames) or not run.loggers.takes_film():
+        return
+    camera, seconds = targets.frames[0].camera, metrics["seconds"]
+    share = min(1.0, (_FILM_SIZE / max(camera.width, camera.height)) ** 2)
+    most = (2 + seconds["train"] / 20) / max(share * seconds["render_per_frame"], 1e-9)
+    if most < _FILM_LEAST:
+        return
+    shots = shots_of_views(targets.frames, min(_FILM_MOST, int(most)), _FILM_SIZE)
+    images = video(module, shots, targets.background.to(module.device))
+    file = write_video(Path(run.folder) / "videos" / "test.gif", images, fps=_FILM_RATE)
+    run.loggers.log_film("film/test", file, sum(done["steps"] for done in run.finished().values()))
 
 
 def scores_to_log(metrics: dict) -> dict[str, float]:

@@ -8,8 +8,10 @@ from __future__ import annotations
 import math
 import time
 from collections import defaultdict
+from collections.abc import Mapping, Sequence
 
 import lightning
+import torch
 
 from forewarp.methods.method import check_least
 from forewarp.progress import ProgressLine, time_text
@@ -88,15 +90,27 @@ class StageProgress(lightning.Callback):
 
 
 class Scalars(lightning.Callback):
-    """Log the means over the last ``every`` steps: loss, unweighted terms, PSNR, learning rates and counts.
+    """Log the means over the last ``every`` steps of all values in ``module.last``, as ``train/<name>``.
 
-    Keys: ``train/<name>`` for all values in ``module.last``, ``lr/<parameter group>``.
+    And of each parameter group the learning rate of the last step, ``lr/<group>``, and the norm of its
+    gradient before it is clipped, ``grad_norm/<group>``, which is measured only at steps that are logged.
+
+    Args:
+        every: steps between two.
+        lr, grad_norm: False leaves these out.
     """
 
-    def __init__(self, *, every: int = 20) -> None:
+    def __init__(self, *, every: int = 20, lr: bool = True, grad_norm: bool = True) -> None:
         check_least(1, of="callbacks.scalars", every=every)
-        self.every = every
+        self.every, self.lr, self.grad_norm = every, lr, grad_norm
         self._values: dict[str, list[float]] = defaultdict(list)
+        self._norms: dict[str, float] = {}
+
+    def on_before_optimizer_step(self, trainer, module, optimizer) -> None:
+        """Measure the gradients if the step will be logged."""
+        if self.grad_norm and (module.global_step + 1) % self.every == 0:
+            with module.clock.paused():
+                self._norms = gradient_norms(optimizer.param_groups)
 
     def on_train_batch_end(self, trainer, module, outputs, batch, batch_idx) -> None:
         """Collect the values of the step; log their means if it is time."""
@@ -113,7 +127,18 @@ class Scalars(lightning.Callback):
     def _log(self, trainer, module) -> None:
         scalars = {f"train/{name}": sum(values) / len(values) for name, values in self._values.items()}
         self._values.clear()
-        for group in trainer.optimizers[0].param_groups:
+        for group in trainer.optimizers[0].param_groups if self.lr else ():
             scalars[f"lr/{group['name']}"] = group["lr"]
+        scalars |= {f"grad_norm/{name}": norm for name, norm in self._norms.items()}
+        self._norms = {}
         with module.clock.paused():
             module.trackers.log(scalars, module.global_step)
+
+
+def gradient_norms(groups: Sequence[Mapping]) -> dict[str, float]:
+    """Return the Euclidean norm of the gradient of each parameter group that has one, by the group's name."""
+    found = {}
+    for group in groups:
+        if gradients := [p.grad for p in group["params"] if p.grad is not None]:
+            found[group["name"]] = float(torch.stack(torch._foreach_norm(gradients)).norm())
+    return found

@@ -5,8 +5,9 @@ from __future__ import annotations
 import csv
 import os
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
+from dataclasses import dataclass
 from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
@@ -14,10 +15,11 @@ from pathlib import Path
 from filelock import FileLock
 from lightning.pytorch.loggers import CSVLogger, Logger, MLFlowLogger, TensorBoardLogger, WandbLogger
 from lightning.pytorch.loggers.csv_logs import ExperimentWriter
+from tensorboard.compat.proto.summary_pb2 import Summary
 from torch import Tensor
 
-from forewarp.drawing.images import to_bytes
-from forewarp.files import read_json, write_json
+from forewarp.drawing.images import image_size, to_bytes
+from forewarp.files import MOST_CONFIG, read_json, read_text, write_json
 
 IDS = "loggers.json"  # in the run's folder: which run of its tracker each logger goes on with
 _PACKAGES = {WandbLogger: "wandb", MLFlowLogger: "mlflow"}
@@ -55,6 +57,23 @@ class CsvLogger(CSVLogger):
         return self._experiment
 
 
+@dataclass(frozen=True)
+class Labels:
+    """How trackers file a run.
+
+    Attributes:
+        scene: the group of Weights & Biases where there is no sweep.
+        sweep: that the run is a job of: that group, and a tag ``sweep`` of MLflow.
+        tags: of Weights & Biases, and of MLflow, with the value true.
+        config: whether trackers get the run's ``config.yaml`` as text.
+    """
+
+    scene: str | None = None
+    sweep: str | None = None
+    tags: Sequence[str] = ()
+    config: bool = False
+
+
 class RunLoggers:
     """Open the loggers of a run when something is first logged, and close them when the run ends.
 
@@ -63,6 +82,7 @@ class RunLoggers:
         folder: the run's folder.
         runs: the folder of all runs, where trackers that hold many of them write.
         hyperparameters: gives them by flat name, when something is first logged.
+        labels: how trackers file the run.
 
     As a context manager it closes them, as failed after an exception.
     """
@@ -73,9 +93,10 @@ class RunLoggers:
         folder: Path = Path("."),
         runs: Path = Path("."),
         hyperparameters: Callable[[], Mapping[str, object]] = dict,
+        labels: Labels = Labels(),
     ) -> None:
         self.makers, self.folder, self.runs = dict(makers), Path(folder), Path(runs)
-        self.hyperparameters = cache(hyperparameters)
+        self.hyperparameters, self.labels = cache(hyperparameters), labels
         self._open: dict[str, Logger] | None = None
         self._closing: list[Callable[[str], None]] = []
         self._failed: set[str] = set()
@@ -120,9 +141,13 @@ class RunLoggers:
             self.runs.mkdir(parents=True, exist_ok=True)
         options = {"save_dir": str(self.folder)}
         if kind is WandbLogger:  # its links may not lie in a run's folder
-            options = {"save_dir": str(self.runs), "name": title, "id": known}
+            group = maker.keywords.get("group") or self.labels.sweep or self.labels.scene
+            tags = [*(maker.keywords.get("tags") or ()), *self.labels.tags]
+            options = {"save_dir": str(self.runs), "name": title, "id": known, "group": group, "tags": tags}
         elif kind is MLFlowLogger:
-            options = self._store(maker) | {"run_name": title, "run_id": known}
+            tags = dict.fromkeys(self.labels.tags, "true") | (maker.keywords.get("tags") or {})
+            tags |= {"sweep": self.labels.sweep} if self.labels.sweep else {}
+            options = self._store(maker) | {"run_name": title, "run_id": known, "tags": tags}
         elif kind in (TensorBoardLogger, CsvLogger):
             options |= {"purge_step": step + 1} if kind is TensorBoardLogger else {"first": step}
         # Only one job of a sweep may make the database.
@@ -133,6 +158,8 @@ class RunLoggers:
             ids[name] = str(logger.version)
         if not (known and kind is MLFlowLogger):  # which takes each parameter once
             logger.log_hyperparams(dict(self.hyperparameters()))
+        if self.labels.config and not known and (file := self.folder / "config.yaml").is_file():
+            self._guard(name, _log_text, logger, "config", read_text(file, MOST_CONFIG), step)
         self._closing.append(logger.finalize)
         log_metrics = logger.log_metrics
 
@@ -183,6 +210,16 @@ class RunLoggers:
             elif hasattr(logger, "log_image"):  # Weights & Biases, and loggers made like it
                 self._guard(name, logger.log_image, title, [pixels], step=step)
 
+    def takes_film(self) -> bool:
+        """Tell whether a logger that is open takes films."""
+        return any(isinstance(one, TensorBoardLogger | MLFlowLogger | WandbLogger) for one in self.open())
+
+    def log_film(self, title: str, file: Path, step: int) -> None:
+        """Log a GIF to each logger that takes films; ``step`` is of the whole run."""
+        for name, logger in zip(self.makers, self.open(0, step)):
+            self._guard(name, _log_film, logger, title, file, step)
+            self._guard(name, logger.save)
+
     def log_scores(self, scores: Mapping[str, float], step: int) -> None:
         """Log the scores of a measured run, in TensorBoard beside its hyperparameters (HPARAMS).
 
@@ -207,6 +244,27 @@ class RunLoggers:
             if isinstance(logger, WandbLogger):  # else the next job of a sweep would go on in this run
                 self._guard(name, logger.experiment.finish, exit_code=0 if kind is None else 1)
         self._open, self._closing = None, []
+
+
+def _log_text(logger: Logger, title: str, text: str, step: int) -> None:
+    if isinstance(logger, TensorBoardLogger):
+        logger.experiment.add_text(title, f"```yaml\n{text}\n```", step)  # which it shows as Markdown
+    elif isinstance(logger, MLFlowLogger):
+        logger.experiment.log_text(logger.run_id, text, f"{title}.yaml")
+    elif isinstance(logger, WandbLogger):
+        logger.log_text(title, columns=[f"{title}.yaml"], data=[[text]])
+
+
+def _log_film(logger: Logger, title: str, file: Path, step: int) -> None:
+    if isinstance(logger, TensorBoardLogger):  # its add_video would encode a GIF too, by another package
+        (width, height), film = image_size(file), file.read_bytes()
+        image = Summary.Image(height=height, width=width, colorspace=3, encoded_image_string=film)
+        summary = Summary(value=[Summary.Value(tag=title, image=image)])
+        logger.experiment.file_writer.add_summary(summary, step)
+    elif isinstance(logger, MLFlowLogger):
+        logger.experiment.log_artifact(logger.run_id, str(file), title)
+    elif isinstance(logger, WandbLogger):
+        logger.log_video(title, [str(file)], step=step, format=["gif"])
 
 
 def _class_of(maker: Callable[..., Logger]) -> type:
