@@ -11,7 +11,7 @@ BIN := .venv/bin
 LINKS = links="$$($(BIN)/pip config get global.find-links 2>/dev/null || echo "$$PIP_FIND_LINKS")"; \
 	if [ -n "$$links" ]; then export UV_FIND_LINKS="$$links"; fi
 ADD = $(LINKS); VIRTUAL_ENV="$$PWD/.venv" $(BIN)/uv pip install --compile-bytecode -c constraints.txt -e
-KEYS := DATA SCENES METHODS MODEL PRESET MINUTES STEPS SEEDS SWEEPS CHANGES VIEWS OUT JOBS THREADS LAUNCHER DEVICE MORE SMALL
+KEYS := DATA SCENES METHODS MODEL PRESET MINUTES STEPS SEEDS SWEEPS CHANGES VIEWS OUT JOBS THREADS LAUNCHER DEVICE MORE SMALL PLAN_ONLY
 REPRODUCE = $(BIN)/forewarp-reproduce $(1) $(foreach key,$(KEYS),$(if $(findstring command,$(origin $(key))),$(key)='$($(key))'))
 
 help: ## show this list

@@ -35,6 +35,14 @@ def _one_thread():
     torch.set_num_threads(1)
 
 
+@pytest.fixture(scope="session", autouse=True)
+def _times_of_tests(tmp_path_factory):
+    """What jobs of tests take is kept apart from the user's."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("FOREWARP_TIMES", str(tmp_path_factory.mktemp("times") / "times.csv"))
+        yield
+
+
 @pytest.fixture
 def two_threads():
     """Two threads, so that sums are made in more than one chunk."""

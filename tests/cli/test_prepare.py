@@ -1,13 +1,15 @@
 """What a command is refused for before anything heavy is loaded."""
 
 import re
+from types import SimpleNamespace
 
 import pytest
 from omegaconf import OmegaConf
 
-from forewarp.cli.prepare import READ, refuse_missing_scene, refuse_numbers
+from forewarp.cli.prepare import READ, refuse_missing_scene, refuse_numbers, refuse_unwatched
 from forewarp.data import module as data_module
 from forewarp.data.files import LAYOUTS, SceneError
+from forewarp.training.stopping import StopRule
 
 
 @pytest.mark.parametrize(
@@ -62,3 +64,16 @@ def test_a_scene_is_told_by_the_file_that_its_reader_asks_for(name, tmp_path):
 def test_every_module_that_reads_a_folder_has_a_layout():
     modules = (each for each in vars(data_module).values() if hasattr(each, "_reader"))
     assert {each.__name__ for each in modules} == {*READ}
+
+
+def test_a_target_needs_views_that_are_not_trained_on():
+    def run_of(count, **target):
+        data = SimpleNamespace(watched=lambda: range(count))
+        return SimpleNamespace(target=StopRule(**target), datamodule=data)
+
+    refuse_unwatched(run_of(0))
+    refuse_unwatched(run_of(1, psnr=30))
+    with pytest.raises(
+        ValueError, match="^target: expected views that are .*, but got none; set data.held_out=8$"
+    ):
+        refuse_unwatched(run_of(0, plateau=1))

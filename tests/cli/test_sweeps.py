@@ -210,3 +210,26 @@ def test_jobs_that_fail_are_named_and_stop_no_other(launcher, start, tmp_path):
     listed = [line for line in failed.splitlines() if line.startswith("  forewarp-train ")]
     assert ["data.scene=lego" in line for line in listed] == [True]  # what Ray passes on may come later
     assert len(measured(tmp_path)) == 1
+
+
+@pytest.mark.slow
+def test_a_sweep_says_first_what_it_costs_by_its_own_jobs(ok, in_tmp, monkeypatch):
+    monkeypatch.setenv("FOREWARP_TIMES", str(in_tmp / "times.csv"))
+    write(in_tmp / "vehicle")
+    words = ["train", "--multirun", *VOXELS, "data=dnerf", "data.root=.", "data.scene=vehicle"]
+    words += ["budget.iterations=8"]
+    plan = ok(*words, "seeds=2", "plan_only=true").out.splitlines()
+    assert plan[0] == "2 jobs; 1 at a time"
+    assert [line.split()[-1] for line in plan[-2:]] == [f"runs/vehicle/forward-demo-seed{n}" for n in (0, 1)]
+    assert sorted(path.name for path in in_tmp.iterdir()) == ["vehicle"]
+    said = ok(*words, "seeds=2").out
+    assert said.startswith("2 jobs; 1 at a time\n")
+    rows = read_rows(in_tmp / "times.csv")
+    assert [(row["model"], row["scene"], float(row["steps"])) for row in rows] == [
+        ("forward", "vehicle", 8)
+    ] * 2
+    assert all(float(row["views"]) == 2 and float(row["disk"]) > 0 for row in rows)
+    first, *lines = ok(*words, "seeds=3", "plan_only=true").out.splitlines()
+    assert first == "3 jobs: 2 finished before, 1 to do"
+    assert "  by runs of this machine (1)" in lines
+    assert [line.split()[0] for line in lines[-3:-1]] == ["finished"] * 2

@@ -303,3 +303,10 @@ def test_paths_and_names_are_taken_as_typed(fitted, in_tmp, ok):
     ok("train", f"resume={root}/läufe/{name}", "evaluate=false")
     ok("evaluate", f"run={root}/läufe/{name}", f"data.root={root}", "views=1", "sheets=0")
     assert (root / "läufe" / name / "metrics.json").is_file()
+
+
+def test_plan_only_says_what_a_run_costs_and_writes_nothing(ok, scenes, in_tmp):
+    done = ok(*arguments(scenes, "run", "plan_only=true"))
+    first, *_, last = done.out.splitlines()
+    assert (first, last) == ("1 job", "  run: run")
+    assert not [*in_tmp.iterdir()]

@@ -11,6 +11,7 @@ from forewarp.files import read_rows
 from forewarp.scene.frame import Truth
 from forewarp.training.loggers import CsvLogger, RunLoggers
 from forewarp.training.stages import Run
+from forewarp.training.stopping import StopRule
 from tests.support.tiny_scene import Interrupt, ball_scene, forward_model, stage, trainer
 
 EXPECTED = [("coarse", 2), ("coarse", 4), ("coarse", 7)]
@@ -144,3 +145,80 @@ def test_a_damaged_curve_is_named(content, tmp_path):
     (tmp_path / "accuracy_time.csv").write_bytes(content)
     with pytest.raises(ValueError, match=r"accuracy_time.csv: expected a table.*delete it"):
         run(tmp_path).fit()
+
+
+def of_step(*values):
+    """A PSNR of each step, in place of rendering."""
+    return lambda module, targets, rays: values[module.global_step - 1]
+
+
+THIRTY = StopRule(psnr=30)
+
+
+@pytest.fixture
+def each_step(monkeypatch):
+    """Beside a target, a row after every step; ``each_step(20, 31, ...)`` are their PSNRs."""
+    monkeypatch.setattr("forewarp.evaluation.curves._FIRST_STEP", 1)
+
+    def psnr(*values):
+        monkeypatch.setattr("forewarp.evaluation.curves.validation_psnr", of_step(*values))
+
+    return psnr
+
+
+def aimed(folder, *more, target=THIRTY, stages=("coarse",)):
+    """A run whose last stage has a target."""
+    made = run(folder, *more, stages=stages)
+    made.target, callbacks = target, made.callbacks
+
+    def with_target(name, where):
+        found = callbacks(name, where)
+        for curve in (each for each in found if isinstance(each, AccuracyCurve)):
+            curve.target = target if name == stages[-1] else StopRule()
+        return found
+
+    made.callbacks = with_target
+    return made
+
+
+@pytest.mark.parametrize("ends", [[], [Interrupt("coarse", 3)], [Interrupt("coarse", 5)], [Crash(4)]])
+def test_two_rows_in_a_row_at_the_target_end_the_stage_also_of_a_continued_run(tmp_path, each_step, ends):
+    each_step(20, 31, 29, 30, 32, 33, 34)
+    said = []
+    for end in ends:
+        with pytest.raises(SystemExit):
+            aimed(tmp_path, end).fit()
+    made = aimed(tmp_path)
+    made.tell = said.append
+    module = made.fit()
+    assert (module.global_step, steps(tmp_path)[-1]) == (5, ("coarse", 5))
+    done = made.finished()["coarse"]
+    target = {"psnr": 30, "plateau": None, "reached": "target.psnr", "step": 4, "held_out_psnr": 30.0}
+    assert done["steps"] == 5
+    assert done["target"] == target | {"seconds": pytest.approx(4000, abs=100)}
+    assert said[-1].endswith("step 4 of the stage, with 30.00 dB of views not trained on (target.psnr=30)")
+
+
+def test_a_target_that_is_not_reached_is_said_and_the_budget_ends_training(tmp_path, each_step):
+    each_step(20, 31, 29, 30, 29, 31, 29)
+    made, said = aimed(tmp_path), []
+    made.tell = said.append
+    assert made.fit().global_step == 7
+    assert made.finished()["coarse"]["target"]["reached"] is None
+    assert said == ["coarse: target.psnr=30 not reached within the budget"]
+
+
+def test_only_the_last_stage_is_ended(tmp_path, each_step):
+    each_step(31, 31, 31, 31, 31, 31, 31)
+    made = aimed(tmp_path, stages=("coarse", "fine"))
+    assert made.fit().global_step == 2
+    assert {name: done["steps"] for name, done in made.finished().items()} == {"coarse": 7, "fine": 2}
+
+
+def test_a_plateau_is_two_doublings_in_a_row_that_gain_little(tmp_path, each_step):
+    # Gains since half the steps: 2 of step 4 (from 22), 1.2 of 5 (from 22.8), 0.5 of 6 (from 23.5).
+    each_step(20, 22, 23.5, 24, 24, 24, 24)
+    made = aimed(tmp_path, target=StopRule(plateau=1.5))
+    assert made.fit().global_step == 6
+    done = made.finished()["coarse"]["target"]
+    assert (done["reached"], done["step"], done["held_out_psnr"]) == ("target.plateau", 5, 24.0)

@@ -47,13 +47,14 @@ def test_each_decibel_names_the_first_to_reach_it_in_all_seeds(tmp_path):
         "1",
         "2",
         "25.0 (20.0, 30.0)",
+        "2 of 2",
         "25.50 (25.50, 25.50)",
         "",
         "100 (100, 100)",
     ]
     csv = table.read_text().splitlines()
     assert csv[0].startswith(
-        "variant,minutes,seeds,seconds to 25 dB,seconds to 25 dB ci95,seconds to 25 dB n,PSNR"
+        "variant,minutes,seeds,seconds to 25 dB,seconds to 25 dB ci95,seconds to 25 dB n,reached"
     )
     assert (len(csv), picture.name) == (4, "accuracy-time-ball.png")
 
@@ -67,12 +68,28 @@ def test_a_target_of_ones_own_and_what_has_no_curve(tmp_path):
     (tmp_path / "others.yaml").write_text(yaml.safe_dump([other._asdict() for other in others]))
     options = {"target": 20.0, "published": tmp_path / "others.yaml"}
     page = write_accuracy_time(tmp_path / "runs", tmp_path, **options)[0].read_text()
-    assert rows_of(page, "base")[0][1:6] == ["0.05", "1", "10.0", "25.50", "0.2500"]
+    assert rows_of(page, "base")[0][1:7] == ["0.05", "1", "10.0", "1 of 1", "25.50", "0.2500"]
     assert "* ball/failed-1.0-seed0: no accuracy_time.csv; run its command with data.held_out=8" in page
     assert "* ball/killed-1.0-seed0: no metrics.json; run its command again" in page
     assert not rows_of(page, "killed")
     assert "* dnerf: 32 dB, 100 s, a GPU; its paper" in page
     assert "* hypernerf" not in page  # whose means say nothing of this scene
+
+
+def test_runs_that_miss_the_target_that_all_had_are_counted(tmp_path):
+    common = {"config": {"target": {"psnr": 24.5, "plateau": None}}}
+    ends = {0: ((10, 20.0), (20, 24.6), (22, 24.7)), 1: ((10, 20.0), (30, 24.5), (33, 24.9))}
+    ends |= {2: ((10, 20.0), (40, 24.9), (60, 24.4)), 3: ((10, 20.0), (40, 24.5), (41, 24.5))}
+    for seed, curve in ends.items():
+        write_run(tmp_path / "runs", "base", seed, curve=curve, **common)
+    write_run(tmp_path / "runs", "never", curve=((10, 20.0), (60, 24.4)), **common)
+    text = write_accuracy_time(tmp_path / "runs", tmp_path / "out")[0].read_text()
+    assert "seconds to 24.5 dB" in text
+    # 20, 30 and 40 s: a deviation of 10, times 4.303 / sqrt(3).
+    assert rows_of(text, "base")[0][2:5] == ["4", "30.0 ± 24.8", "3 of 4"]
+    assert rows_of(text, "never")[0][3:5] == ["", "0 of 1"]
+    # All four reach 24 dB, after 20, 30, 40 and 40 s: a deviation of 9.574, times 3.182 / 2.
+    assert rows_of(text, "24")[0][1:3] == ["32.5 ± 15.2", "base"]
 
 
 def test_some_training_views_are_no_seed_of_all_of_them(tmp_path):

@@ -169,3 +169,21 @@ def test_runs_of_a_folder_share_decoded_frames(tmp_path, monkeypatch):
     (tmp_path / "theirs" / ".frames").symlink_to(ours)
     assert folder("theirs/a/particles") == tmp_path / "theirs" / "a" / ".frames"  # no link is followed
     assert content_hash(config_of()) == content_hash(config_of("+data.disk_cache_bytes=1"))
+
+
+def test_a_target_that_cannot_end_anything_is_refused():
+    assert not build.target_of(config_of()).is_set
+    assert build.target_of(config_of("target.psnr=30")).psnr == 30
+    for words, line in {
+        ("target.psnr=-1",): "target.psnr: expected a number of dB above 0, or null, but got -1",
+        ("target.psnr=30", "callbacks.accuracy=null"): "callbacks.accuracy: expected the curve that a target",
+        ("+target.pnsr=30",): "target: expected psnr and plateau, but got pnsr",
+    }.items():
+        with pytest.raises(ValueError, match=f"^{line}"):
+            build.target_of(config_of(*words))
+
+
+def test_a_target_makes_another_run_and_none_is_as_before():
+    config = config_of()
+    before = OmegaConf.masked_copy(config, [key for key in config if key != "target"])
+    assert content_hash(before) == content_hash(config) != content_hash(config_of("target.psnr=30"))

@@ -11,7 +11,7 @@ import sys
 import tempfile
 import traceback
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
 
@@ -52,7 +52,7 @@ def command(name: str, task: Callable, text: str, *, config: str | None = None) 
             logging.disable(logging.NOTSET)  # Hydra logs what it prints
             logging.raiseExceptions = False  # of a reader that closed the output
         failures: list[int] = []
-        words = _arguments(name)
+        words = arguments_of(name, sys.argv[1:])
         for sys.argv[1:] in commands_of(words) if name == "train" else [words]:
             failures += _run(name, task, configurations(), config)
             if any(failures):
@@ -72,18 +72,19 @@ def command(name: str, task: Callable, text: str, *, config: str | None = None) 
     sys.exit(max(failures, default=0))
 
 
-def _arguments(name: str) -> list[str]:
-    """Return the command line as Hydra takes it: a bare folder has its key, a plan is its overrides, options
+def arguments_of(name: str, typed: Sequence[str]) -> list[str]:
+    """Return a command line as Hydra takes it: a bare folder has its key, a plan is its overrides, options
     come last.
 
     ``dataset=NAME`` is ``experiment=NAME`` where scenes are trained on, and a group where they are written.
     """
-    arguments = as_text(with_run_key(name, sys.argv[1:]))
+    arguments = as_text(with_run_key(name, typed))
     if name in ("train", "plan"):
         arguments = [re.sub(r"^dataset=", "experiment=", argument) for argument in arguments]
         for seeds in (argument[6:] for argument in arguments if argument.startswith("seeds=")):
             if not re.fullmatch("[1-9][0-9]*", seeds):  # of none Hydra would run nothing, and say nothing
                 raise ValueError(f"seeds: expected a whole number of at least 1, but got {seeds}")
+    arguments += ["~hydra.callbacks.cost"] * (name == "plan")  # its jobs train nothing
     refuse_dashes(arguments)
     if any(argument.startswith("plan=") for argument in arguments):
         from forewarp.planning.plan_file import with_plan
@@ -137,18 +138,20 @@ def _run(name: str, task: Callable, conf: Path, config_name: str) -> list[int]:
     import hydra
 
     from forewarp.runs.config import TRUST_VARIABLE
+    from forewarp.runs.jobs import PlanOnly
 
     # Travels with the job, as a launcher may not pass the environment on.
     trust = {TRUST_VARIABLE: os.environ[TRUST_VARIABLE]} if TRUST_VARIABLE in os.environ else {}
     typed_once = {key_of(word) for word in sys.argv[1:] if not word.startswith("-") and not is_sweep(word)}
+    overrides.constant.clear()  # of an earlier sweep of this process
+    overrides.constant.update(typed_once)
 
     def job(config) -> object:
         status, result = 0, None
         try:
             quiet()  # again, as a launcher may start another process
             os.environ.update(trust)
-            overrides.constant.clear()  # of an earlier sweep of this process
-            overrides.constant.update(typed_once)
+            overrides.constant.update(typed_once)  # it may be another process
             result = task(config)
         except Exception as error:  # caught here, as Hydra would print a message of its own
             status = _tell(name, error, config_name)
@@ -164,7 +167,8 @@ def _run(name: str, task: Callable, conf: Path, config_name: str) -> list[int]:
         ended = Path(folder) / "ended"
         ended.touch()
         try:
-            hydra.main(version_base="1.3", config_path=str(conf), config_name=config_name)(job)()
+            with suppress(PlanOnly):
+                hydra.main(version_base="1.3", config_path=str(conf), config_name=config_name)(job)()
         finally:  # a sweeper may fail, too
             jobs = [json.loads(line) for line in ended.read_text().splitlines()]
             if len(jobs) > 1:

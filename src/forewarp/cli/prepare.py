@@ -125,6 +125,7 @@ def prepare(config: DictConfig) -> Prepared | None:
     if not measured:
         run.check_device()
         run.datamodule.setup("fit")
+        refuse_unwatched(run)
         if config.evaluate and config.get("reduce") is not None:
             run.datamodule.targets("test").reduced(config.reduce)
         if not is_planned:  # else the plan has said so
@@ -172,6 +173,13 @@ def refuse_missing_start(config: DictConfig) -> None:
     if not any(Path(config.run).glob("*/last.ckpt")) and not any(Path(start).glob("*/done.json")):
         advice = "make it by the same command with windows=still, without data.window and start"
         raise mismatch("start", "a finished run of what stands still", f"none in {start}", advice)
+
+
+def refuse_unwatched(run: Run) -> None:
+    """Refuse a target where no view is left to read it from."""
+    if run.target.is_set and not len(run.datamodule.watched()):
+        advice = "set data.held_out=8"
+        raise mismatch("target", "views that are not trained on, and no test views", "none", advice)
 
 
 def refuse_seeds(config: DictConfig) -> None:

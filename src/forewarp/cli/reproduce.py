@@ -33,6 +33,8 @@ Keys (capitals do, too):
   launcher=NAME     where jobs run, as of forewarp-train;  device=cpu|gpu  of gpu
   more="K=V ..."    overrides added to every sweep
   small=1           tiny scenes and a few steps, to try the command
+  plan_only=true    say how many runs there are and what they will take, and end there; without it that is
+                    said first (not with small=1)
 """
 
 from __future__ import annotations
@@ -49,13 +51,16 @@ from types import SimpleNamespace
 
 import yaml
 
-from forewarp.cli.entry import INTERRUPTED, MISTAKE, project_root
+from forewarp.cli.entry import INTERRUPTED, MISTAKE, arguments_of, project_root
+from forewarp.cli.mistakes import one_line
 from forewarp.data.files import one_of
-from forewarp.runs.overrides import merged
+from forewarp.runs import overrides
+from forewarp.runs.config_files import configurations
+from forewarp.runs.overrides import key_of, merged
 
 # Keys that may be typed, with what they are where they are left out.
 KEYS = shlex.split("data scenes methods model preset minutes steps seeds sweeps changes views out threads")
-KEYS = dict.fromkeys([*KEYS, "launcher", "more", "small"], "") | {"jobs": "2", "device": "gpu"}
+KEYS = dict.fromkeys([*KEYS, "launcher", "more", "small", "plan_only"], "") | {"jobs": "2", "device": "gpu"}
 TABLES = ["dnerf", "hypernerf", "nhr", "lego_complete"]
 ABLATIONS = ["ablation_modules", "ablation_losses"]
 OF_FORWARD = [*ABLATIONS, "resolution"]
@@ -349,6 +354,33 @@ def gpu(keys: Keys) -> Job:
     return Job([lane], then)
 
 
+def cost_of(job: Job) -> list[str]:
+    """Say in lines how many runs a job has, and what they will take.
+
+    Raises:
+        ValueError, HydraException, OmegaConfBaseException: if a run is no possible one.
+    """
+    from hydra import compose, initialize_config_dir
+    from omegaconf import read_write
+
+    from forewarp.runs.cost import Total, joined
+    from forewarp.runs.jobs import cost_of_sweep
+
+    def total_of(sweep: Sweep) -> Total:
+        typed = arguments_of("train", sweep)
+        single = [word for word in typed if not overrides.is_sweep(word)]
+        config = compose("train", [*single, "hydra.mode=MULTIRUN"], return_hydra_config=True)
+        with read_write(config.hydra):
+            config.hydra.overrides.task = [word for word in typed if not word.startswith("hydra.")]
+        overrides.constant.clear()
+        overrides.constant.update(map(key_of, single))
+        return cost_of_sweep(config)[1]
+
+    with initialize_config_dir(str(configurations()), version_base="1.3"):
+        lanes = [[total_of(sweep) for sweep in lane] for lane in job.lanes]
+    return joined(lanes, min(job.jobs, len(lanes))).lines()
+
+
 KINDS = demo, tables, ablations, accuracy_time, price_list, effects, gpu
 KINDS = {kind.__name__.replace("_", "-"): kind for kind in KINDS}
 
@@ -375,6 +407,7 @@ def _call(name: str, arguments: list[str], prefix: str = "") -> int:
     if name == "train" and not any(word.startswith("run=") for word in arguments):
         arguments = ["--multirun", *arguments]
     print(f"{prefix}{shlex.join([f'forewarp-{name}', *arguments])}", flush=True)
+    arguments = [*arguments, *["~hydra.callbacks.cost"] * (name == "train")]  # all of it was said before
     command = [str(Path(sys.executable).with_name(f"forewarp-{name}")), *arguments]
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT} if prefix else {}
     with subprocess.Popen(command, text=True, **pipes) as process:
@@ -397,12 +430,21 @@ def main() -> None:
         print(__doc__.strip())
         return
     try:
-        job = plan_of(kind, Keys.typed(arguments))
+        keys = Keys.typed(arguments)
+        job = plan_of(kind, keys)
     except ValueError as error:
         print(f"forewarp-reproduce: error: {error}", file=sys.stderr)
         sys.exit(MISTAKE)
+    plan_only = keys.plan_only not in ("", "false", "0")
     try:
-        sys.exit(run(job))
+        if plan_only or not keys.small:
+            print(*cost_of(job), sep="\n", flush=True)
+    except Exception as error:  # else the sweep with the mistake says so
+        if plan_only:
+            print(f"forewarp-reproduce: error: {one_line(error) or error}", file=sys.stderr)
+            sys.exit(MISTAKE)
+    try:
+        sys.exit(0 if plan_only else run(job))
     except KeyboardInterrupt:
         print("\nforewarp-reproduce: interrupted; run the same command again to go on", file=sys.stderr)
         sys.exit(INTERRUPTED)

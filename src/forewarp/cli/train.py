@@ -12,6 +12,9 @@ What one types most (beside options such as --multirun or --config-dir=FOLDER):
   budget.minutes=N                    of training, all stages together; 10 with preset=fast
   budget.clock=wall|processor         what minutes are of; processor time does not depend on other work
   budget.iterations=N                 the same in steps; the first that is reached ends training
+  target.psnr=DB                      end earlier: once views held out reach it (with data.held_out=8)
+  target.plateau=DB                   or once a doubling of training time gains less
+  plan_only=true                      say what it will cost, also with --multirun, and end there
   model=particles|forward|backward    Gaussians (default), the paper's method, its like-for-like opponent
   model=nerf|tnerf|dnerf|nerfies|hypernerf   networks along rays, as in their papers with preset=faithful
   model=ndvg|tineuvox_s|tineuvox_b    voxel grids with networks, as in their papers with preset=faithful
@@ -42,7 +45,8 @@ What one types most (beside options such as --multirun or --config-dir=FOLDER):
                                       or at once with launcher=joblib; the same as windows=still, then =each
   launcher=local|joblib|ray|slurm|submitit   where the jobs of --multirun run
   ~stage.fine                         drop a stage
-  --multirun seeds=3                  one run after another; --multirun sweeps=dnerf: a prepared sweep
+  --multirun seeds=3                  one run after another, and before them what they will cost;
+                                      --multirun sweeps=dnerf: a prepared sweep
   --multirun sweeps=accuracy_time stage.fine.density=45,180  what choices cost; see forewarp-report
   --multirun sweeps=price_list_particles seeds=2  the same for every choice, one at a time; also _forward
 
@@ -55,9 +59,11 @@ Watch: tensorboard --logdir runs
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping, Sequence
 from shlex import quote
 
 from forewarp.cli.entry import command
+from forewarp.runs.cost import clocks
 
 # Of a profiler's table: action, calls, seconds in all. The row of the total has no mean.
 _ROW = re.compile(r"^\|\s+(\S.*?)\s*\|\s+\d\S*\s*\|\s+(\d+)\s*\|\s+(\d\S*)\s*\|", re.M)
@@ -71,6 +77,10 @@ def train(config) -> float | None:
     """
     from forewarp.cli.prepare import prepare
 
+    if config.get("plan_only"):
+        print(cost_of_one(config), flush=True)
+        return None
+    moments = [clocks()]
     prepared = prepare(config)
     if prepared is None:  # a sweep goes on without this scene
         return None
@@ -81,8 +91,37 @@ def train(config) -> float | None:
             print(f"measured before: {folder}; again with forewarp-evaluate {words}")
             return prepared.score.of()
         print(beginning(prepared.run, prepared.config), flush=True)
+        is_new = not any(prepared.run.folder.glob("*/last.ckpt"))
         module = prepared.run.fit()
-        return measure(prepared, module)
+        moments.append(clocks())
+        score = measure(prepared, module)
+        if is_new and not prepared.config.get("debug"):  # what earlier parts of a run took is unknown
+            keep_cost(prepared, [*moments, clocks()])
+        return score
+
+
+def cost_of_one(config) -> str:
+    """Say in lines what a run will cost; write nothing."""
+    from forewarp.cli.prepare import refuse_all, refuse_missing_scene
+    from forewarp.runs.config import resumed
+    from forewarp.runs.cost import PRICES, cost_of, job_of, own_file, read_costs, total
+
+    refuse_all(config)
+    config = resumed(config)
+    refuse_missing_scene(config)
+    own = read_costs(own_file())
+    job = job_of(config, own)
+    lines = total([(job, cost_of(job, own, read_costs(PRICES)))], 1).lines()
+    return "\n".join([*lines, f"  run: {job.folder}"])
+
+
+def keep_cost(prepared, moments: Sequence[Mapping[str, float]]) -> None:
+    """Keep what a run took for estimates to come; ``moments``: it began, was fitted, was measured."""
+    from forewarp.runs.cost import add_cost, measured_cost
+
+    frames = prepared.run.datamodule.scene.test
+    pixels = max((frame.camera.width * frame.camera.height for frame in frames), default=None)
+    add_cost(measured_cost(prepared.config, prepared.run.folder, moments, pixels=pixels))
 
 
 def measure(prepared, module) -> float | None:

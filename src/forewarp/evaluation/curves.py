@@ -11,9 +11,13 @@ import lightning
 from forewarp.evaluation.evaluate import flow_error
 from forewarp.evaluation.images import validation_psnr
 from forewarp.files import read_json, read_rows, written_whole
+from forewarp.training.stopping import StopRule
 
 FILE = "accuracy_time.csv"
 COLUMNS = ("seconds", "stage", "step", "psnr", "epe_moving", "size")
+# Beside a target: how many times later than the one before a row comes at most, and the first row where
+# steps alone bound the stage. Its rows then come at certain steps, so that it ends at the same one each time.
+_FINE, _FIRST_STEP = 1.1, 32
 
 
 def next_moment(after: float, first: float, ratio: float) -> float:
@@ -38,6 +42,8 @@ class AccuracyCurve(lightning.Callback):
     (voxels, particles, parameters). The loggers get ``curve/psnr``,
     ``curve/epe_moving`` and ``curve/seconds``. A resumed run continues its rows.
 
+    Set ``target`` for the last stage, to end it once the rows say so; they are then made more often.
+
     Args:
         first: seconds until the first row.
         ratio: each row comes this many times later than the one before; a stage's end has a row, too.
@@ -51,6 +57,7 @@ class AccuracyCurve(lightning.Callback):
             expected = "first > 0, ratio > 1 and rays >= 1"
             raise ValueError(f"callbacks.accuracy: expected {expected}, but got {first=}, {ratio=}, {rays=}")
         self.first, self.ratio, self.rays = first, ratio, rays
+        self.target, self._by_steps = StopRule(), False
         self._before, self._next = 0.0, math.inf
 
     def on_train_start(self, trainer, module) -> None:
@@ -60,6 +67,8 @@ class AccuracyCurve(lightning.Callback):
         folder = Path(trainer.default_root_dir)
         done = [read_json(file) or {} for file in folder.parent.glob("*/done.json") if file.parent != folder]
         self._path, self._before = folder.parent / FILE, sum(float(one.get("seconds", 0.0)) for one in done)
+        self._steps_before = sum(int(one.get("steps", 0)) for one in done)
+        self._by_steps = self.target.is_set and module.settings.minutes is None
         now, rows = self._seconds(module), read_rows(self._path)
         try:
             kept = [row for row in rows if float(row["seconds"]) <= now]
@@ -68,12 +77,13 @@ class AccuracyCurve(lightning.Callback):
             got = "another or half a one; delete it, and the curve begins where training goes on"
             expected = f"a table with the columns {', '.join(COLUMNS)}"
             raise ValueError(f"{self._path}: expected {expected}, but got {got}") from error
-        last = float(self._rows[-1]["seconds"]) if self._rows else 0.0
-        self._next = next_moment(last, self.first, self.ratio)
+        self._next = self._after(self._time_of(self._rows[-1], module) if self._rows else 0.0)
 
     def on_train_batch_end(self, trainer, module, outputs, batch, batch_idx) -> None:
         """Add a row if it is due."""
-        if self._before + module.clock.seconds >= self._next:
+        by_clock = self._before + module.clock.seconds
+        now = self._steps_before + module.global_step if self._by_steps else by_clock
+        if now >= self._next:
             self._add(trainer, module)
 
     def on_train_end(self, trainer, module) -> None:
@@ -86,6 +96,25 @@ class AccuracyCurve(lightning.Callback):
 
     def _seconds(self, module) -> float:
         return round(self._before + module.clock.seconds, 3)  # rounded as in the file
+
+    def _after(self, moment: float) -> float:
+        first = _FIRST_STEP if self._by_steps else self.first
+        return next_moment(moment, first, min(self.ratio, _FINE) if self.target.is_set else self.ratio)
+
+    def _time_of(self, row: dict, module) -> float:
+        """Return when a row was made: seconds of training, or steps where these decide, over all stages."""
+        if not self._by_steps:
+            return float(row["seconds"])
+        return self._steps_before + int(row["step"]) * (row["stage"] == module.settings.name)
+
+    def _check_target(self, module) -> None:
+        """End the stage if its rows reach the target; what counts is when the first of two rows did."""
+        rows = [row for row in self._rows if row["stage"] == module.settings.name]
+        curve = [(self._time_of(row, module), float(row["psnr"])) for row in rows]
+        all_in = module.curriculum.in_play == len(module.curriculum.order)
+        if (key := self.target.reached(curve, all_in=all_in)) is not None:
+            when = {"seconds": float(rows[-2]["seconds"]), "step": int(rows[-2]["step"])}
+            module.reached = {"reached": key, **when, "held_out_psnr": float(rows[-2]["psnr"])}
 
     def _add(self, trainer, module) -> None:
         with module.clock.paused():
@@ -102,4 +131,6 @@ class AccuracyCurve(lightning.Callback):
                 writer.writerows(self._rows)
             curve = {f"curve/{name}": value for name, value in scores.items()} | {"curve/seconds": seconds}
             module.trackers.log(curve, module.global_step)
-        self._next = next_moment(seconds, self.first, self.ratio)
+            if self.target.is_set:
+                self._check_target(module)
+        self._next = self._after(self._time_of(self._rows[-1], module))

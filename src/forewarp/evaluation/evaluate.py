@@ -169,6 +169,8 @@ def evaluate(
         "test": summarise(chain(((row["ability"], row["scores"]) for row in per_image), parts)),
     }
     metrics["metrics"] = described(dict.fromkeys(n for scores in metrics["test"].values() for n in scores))
+    if targets := [done["target"] for done in finished.values() if "target" in done]:
+        metrics["target"] = targets[-1]
     for name in others:
         metrics[f"test_{name}"] = summarise((row["ability"], row["others"][name]) for row in per_image)
     for name, of_motion in (("flow", flow_error), ("keypoints", keypoint_transfer)):

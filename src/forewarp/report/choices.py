@@ -75,8 +75,8 @@ def write_accuracy_time(
 
     Args:
         folder, out: see above.
-        target: list each variant's seconds to this PSNR (dB); None: the last whole dB that the base, or else
-            the best run, reached.
+        target: list each variant's seconds to this PSNR (dB); None: the ``target.psnr`` that all runs of a
+            scene ended by, else the last whole dB that the base, or else the best run, reached.
         published: file of results of others, drawn as stars; None: ours.
     """
     others = read_published(published)
@@ -88,9 +88,7 @@ def write_accuracy_time(
         picture, file = out / f"{name}.png", out / f"{name}.csv"
         beside = [other for other in others if other.dataset == found[0]["dataset"]]
         draw_scene(picture, groups, scene, beside)
-        curves = [row["points"] for row in found.where(variant="base") or found]
-        twice = [min(a.psnr, b.psnr) for curve in curves for a, b in zip(curve, curve[1:] or curve)]
-        every = variants(groups, float(math.floor(max(twice))) if target is None else target)
+        every = variants(groups, target_of(found) if target is None else target)
         replace_file(file, every.csv())
         scenes.append({"name": scene, "picture": picture.name, "tables": [cheapest(groups), every]})
         written += [picture, file]
@@ -101,10 +99,21 @@ def write_accuracy_time(
     return [out / "accuracy-time.md", *written]
 
 
+def target_of(runs: Runs) -> float:
+    """Return the ``target.psnr`` that all runs ended by, else the last whole dB that the base reached, or
+    without one the best run.
+    """
+    asked = {(row["config"].get("target") or {}).get("psnr") for row in runs}
+    if len(asked) == 1 and None not in asked:
+        return float(asked.pop())
+    curves = [row["points"] for row in runs.where(variant="base") or runs]
+    twice = [min(a.psnr, b.psnr) for curve in curves for a, b in zip(curve, curve[1:] or curve)]
+    return float(math.floor(max(twice)))
+
+
 def reached(runs: Runs, psnr: float) -> Estimate | None:
-    """Return the seconds to a PSNR over the seeds; None if a seed does not reach this PSNR."""
-    times = [seconds_to(row["points"], psnr) for row in runs]
-    return None if None in times else Estimate.of(times)
+    """Estimate the seconds to a PSNR over the runs that reach it; its ``count`` is how many do."""
+    return Estimate.of(seconds_to(row["points"], psnr) for row in runs)
 
 
 def cheapest(groups: Mapping[tuple, Runs]) -> Table:
@@ -112,8 +121,8 @@ def cheapest(groups: Mapping[tuple, Runs]) -> Table:
     lines = []
     values = [point.psnr for group in groups.values() for row in group for point in row["points"]]
     for psnr in range(math.ceil(min(values)), math.floor(max(values)) + 1):
-        times = [(reached(group, psnr), group[0]) for group in groups.values()]
-        if known := [(seconds, row) for seconds, row in times if seconds is not None]:
+        times = [(reached(group, psnr), group) for group in groups.values()]
+        if known := [(seconds, of[0]) for seconds, of in times if seconds and seconds.count == len(of)]:
             seconds, row = min(known, key=lambda pair: pair[0].mean)
             lines.append([str(psnr), seconds, row["variant"], f"`{row['command']}`"])
     columns = ["for dB", Column("seconds", 1), "variant", "command"]
@@ -123,13 +132,15 @@ def cheapest(groups: Mapping[tuple, Runs]) -> Table:
 def variants(groups: Mapping[tuple, Runs], target: float) -> Table:
     """List for every variant the seconds to the target PSNR and the final numbers."""
     columns = {"variant": "variant", "minutes": Column("minutes", None), "seeds": Column("seeds", 0)}
-    columns |= {"reached": Column(f"seconds to {target:g} dB", 1), "psnr": "PSNR at the end"}
-    columns |= {name: COSTS[name] for name in ("epe", "steps")}
+    columns |= {"reached": Column(f"seconds to {target:g} dB", 1), "who": "reached"}
+    columns |= {"psnr": "PSNR at the end"} | {name: COSTS[name] for name in ("epe", "steps")}
     lines = []
     for group in groups.values():
         ends = Runs(row["points"][-1]._asdict() for row in group if row["points"])
         at_the_end = {name: ends.estimate(name) for name in ("psnr", "epe")}
-        lines.append(group.summary(reached=reached(group, target), **at_the_end))
+        times = reached(group, target)
+        who = f"{times.count if times else 0} of {len(group)}"
+        lines.append(group.summary(reached=times, who=who, **at_the_end))
     return Table.of(lines, columns, "At equal minutes; the steps that were done in them:")
 
 

@@ -29,6 +29,7 @@ NOT_COUNTED = {
     **dict.fromkeys(("logger", "viewer", "host", "port", "sheets"), "what is shown meanwhile"),
     **dict.fromkeys(("evaluate", "score", "lpips_weights"), "what is measured, not how"),
     **dict.fromkeys(("checkpoint_seconds", "resume", "trust", "absent", "data_changed"), "how the job runs"),
+    "plan_only": "such a run is not made",
     **dict.fromkeys(("command", "variant", "debug"), "names; a debug run is left out as a whole"),
     **dict.fromkeys(("capture", "effects", "plan", "planned"), "what chose the effects, which count"),
 }

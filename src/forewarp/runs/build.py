@@ -20,6 +20,7 @@ from omegaconf import DictConfig, OmegaConf
 from forewarp.clock import Clock
 from forewarp.data.files import mismatch, one_of, whole
 from forewarp.data.films import FOLDER
+from forewarp.evaluation.curves import AccuracyCurve
 from forewarp.provenance import RESULTS
 from forewarp.runs.config import IDENTITY, instead_of, is_swept, plain, saved_config, trust_of
 from forewarp.runs.overrides import TEXTS, constant, key_of, typed_overrides
@@ -30,6 +31,7 @@ from forewarp.training.loggers import Labels, RunLoggers
 from forewarp.training.module import DynamicSceneModule
 from forewarp.training.schedule import StagePlan, seconds_after, share_out
 from forewarp.training.stages import Run
+from forewarp.training.stopping import StopRule
 
 PROFILERS = {"simple": SimpleProfiler, "advanced": AdvancedProfiler}  # Lightning's
 _LEVELS = 4  # that a run may lie below the folder of all runs
@@ -70,6 +72,8 @@ def build_run(config: DictConfig) -> Run:
         for callback in callbacks:
             if isinstance(callback, StageProgress):
                 callback.later = seconds_after(run.stages, name)
+            if isinstance(callback, AccuracyCurve) and name == run.stages[-1].settings.name:
+                callback.target = run.target
         return callbacks
 
     run = Run(
@@ -88,6 +92,7 @@ def build_run(config: DictConfig) -> Run:
         loggers=loggers_of(config),
         start=start_of(config),
         packages=packages_of(config),
+        target=target_of(config),
     )
     run.check()
     return run
@@ -122,6 +127,22 @@ def start_of(config: DictConfig) -> Callable[[], tuple[DynamicSceneModule, Hando
         return run.load(), load_handover(run.stage_folder(run.stages[-1]))
 
     return opened
+
+
+def target_of(config: DictConfig) -> StopRule:
+    """Return what ends training before its budget.
+
+    Raises:
+        ValueError: for a key that there is not, or a target that nobody watches.
+    """
+    keys = plain(config.get("target")) or {}  # a run of before has none
+    if unknown := keys.keys() - StopRule.__dataclass_fields__.keys():
+        raise mismatch("target", "psnr and plateau", ", ".join(sorted(unknown)))
+    rule = StopRule(**keys)
+    if rule.is_set and config.callbacks.get("accuracy") is None:
+        advice = "leave out callbacks.accuracy=null and debug=, which switches it off, or the target"
+        raise mismatch("callbacks.accuracy", "the curve that a target is read from", "null", advice)
+    return rule
 
 
 def loggers_of(config: DictConfig) -> RunLoggers:

@@ -30,11 +30,14 @@ from forewarp.runs.overrides import constant, key_of, typed_overrides
 
 # Two runs differ if these keys differ; device, folder and what is shown do not count.
 IDENTITY = ("data", "model", "objective", "stage", "preset", "budget", "seed")
+# Keys that tell runs apart where they are set; configs of before lack them.
+IDENTITY_IF_SET = ("start", "target")
 NOT_OF_RUN = ("cache_bytes", "disk_cache_bytes")  # keys of the data that change no frame
 HASH = "{hash}"
 # May be set beside resume=<run>.
 MAY_CHANGE = "trainer", "threads", "lpips_weights", "sheets", "views", "reduce", "evaluate", "logger"
 MAY_CHANGE += "trackers", "checkpoint_seconds", "sentinel", "data_changed", "score", "viewer", "host", "port"
+MAY_CHANGE += ("plan_only",)
 MOST_LEVELS = 40
 MOST_SEED = 2**31 - 100  # each stage adds its number, and what finds poses takes 31 bits
 TRUST_VARIABLE = "FOREWARP_TRUST"
@@ -139,8 +142,7 @@ def content_hash(config: DictConfig, more: Sequence[str] = (), *others: object) 
     """Return ten digits of a SHA-256 of ``IDENTITY`` and ``more`` keys of a config, and of ``others``."""
     make_absolute(config)
     content = {key: plain(config.get(key)) for key in (*IDENTITY, *more)}
-    if config.get("start") is not None:
-        content["start"] = config.start
+    content |= {key: value for key in IDENTITY_IF_SET if (value := set_value(config, key)) is not None}
     for key in NOT_OF_RUN if isinstance(content["data"], dict) else ():
         content["data"].pop(key, None)
     precision = config.trainer.get("precision")
@@ -153,6 +155,13 @@ def content_hash(config: DictConfig, more: Sequence[str] = (), *others: object) 
     if others:
         content["others"] = others
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:10]
+
+
+def set_value(config: DictConfig, key: str) -> object:
+    """Return what a key holds, as dicts and lists; None where there is nothing but null, or no key."""
+    value = plain(config.get(key))
+    nothing = isinstance(value, dict) and all(part is None for part in value.values())
+    return None if nothing else value
 
 
 def plain(part: object) -> object:

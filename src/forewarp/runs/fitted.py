@@ -493,7 +493,9 @@ def doubts(run: Run, module: DynamicSceneModule, preset: str) -> list[str]:
     in_play = max(noted.get("frames_in_play", len(scene.train)) for noted in made.values())
     if in_play < len(scene.train) and run.stages[-1].settings.curriculum.get("most") is None:
         never = f"{len(scene.train) - in_play} of {len(scene.train)} training images were never trained on"
-        lines.append(f"{never}, as the budget ended before their times came in; raise it")
+        ended = next((n["target"]["reached"] for n in made.values() if "target" in n), None)
+        advice = f"{ended} ended training before their times came in" if ended else ""
+        lines.append(f"{never}, as {advice or 'the budget ended before their times came in; raise it'}")
     if blind := blind_frames(scene):
         lines.append(f"{blind} of {len(scene.train)} training cameras see nothing of the box {bounds(scene)}")
     reached, one_color = training_psnr(run, module)

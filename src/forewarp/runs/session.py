@@ -17,7 +17,15 @@ from omegaconf import DictConfig, OmegaConf
 from forewarp.data.files import LOCK, difference, mismatch, one_of
 from forewarp.files import read_json, read_text, refuse_links, replace_file, write_json
 from forewarp.provenance import installed
-from forewarp.runs.config import IDENTITY, NOT_OF_RUN, make_absolute, read_config
+from forewarp.runs.config import (
+    IDENTITY,
+    IDENTITY_IF_SET,
+    NOT_OF_RUN,
+    make_absolute,
+    plain,
+    read_config,
+    set_value,
+)
 from forewarp.runs.overrides import command_line, typed_folders, typed_overrides
 from forewarp.training.stages import Run
 
@@ -121,8 +129,7 @@ def claim(config: DictConfig, *, finished: bool = False) -> None:
 
 def _refuse_another(path: Path, stored: DictConfig, config: DictConfig) -> None:
     """Refuse a config that describes another run than the one stored at ``path``; name a differing key."""
-    keys = (*IDENTITY, "start")
-    before, now = ({k: OmegaConf.to_container(c).get(k) for k in keys} for c in (stored, config))
+    before, now = map(_identity, (stored, config))
     for part in (before["data"], now["data"]):
         for key in NOT_OF_RUN:
             (part or {}).pop(key, None)
@@ -133,11 +140,19 @@ def _refuse_another(path: Path, stored: DictConfig, config: DictConfig) -> None:
         raise ValueError(f"{expected}, but got {got}{more}; use run=<another folder>, or delete this one")
 
 
+def _identity(config: DictConfig) -> dict[str, object]:
+    """Return what tells a run apart from others, by its keys."""
+    parts = {key: plain(config.get(key)) for key in IDENTITY}
+    return parts | {key: set_value(config, key) for key in IDENTITY_IF_SET}
+
+
 def _differences(old: object, new: object, key: str = "") -> Iterator[tuple[str, object, object]]:
     """Yield the dotted key, the old and the new value wherever two configs differ."""
     if isinstance(old, dict) and isinstance(new, dict):
         for name in [*old, *(name for name in new if name not in old)]:
             inner = f"{key}.{name}" if key else name
+            if old.get(name) is None and new.get(name) is None:
+                continue  # a key that is new since, and null
             yield from _differences(old.get(name, "nothing"), new.get(name, "nothing"), inner)
     elif old != new:
         yield key, old, new

@@ -30,7 +30,7 @@ class DynamicSceneModule(lightning.LightningModule):
         seed: seed of the random numbers that the method draws.
 
     ``last`` holds the values of the last step, by the names under which they are logged; ``trackers`` are the
-    loggers of the run.
+    loggers of the run. What ends the stage before its budget sets ``reached``: what it was, and when.
     """
 
     def __init__(
@@ -49,6 +49,7 @@ class DynamicSceneModule(lightning.LightningModule):
         self.generator = torch.Generator().manual_seed(seed)
         self.clock = Clock()
         self.last: dict[str, float] = {}
+        self.reached: dict[str, object] | None = None
         self.trackers = RunLoggers()
         self._noted: Mapping[str, float] = {}
         self._torch_state: Tensor | None = None
@@ -62,8 +63,8 @@ class DynamicSceneModule(lightning.LightningModule):
 
     @property
     def fraction(self) -> float:
-        """Fraction of the stage that is done, in [0, 1]."""
-        return self.settings.fraction(self.global_step, self.clock.seconds)
+        """Fraction of the stage that is done, in [0, 1]; 1 once its target is reached."""
+        return 1.0 if self.reached else self.settings.fraction(self.global_step, self.clock.seconds)
 
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
         """Take one step of the optimiser, and return the loss.
@@ -169,6 +170,7 @@ class DynamicSceneModule(lightning.LightningModule):
         """Add all that a continued run needs to equal an uninterrupted one to the bit."""
         state = {"generator": self.generator.get_state(), "torch_rng": torch.get_rng_state()}
         state |= {"curriculum": self.curriculum.state_dict(), "clock": self.clock.state_dict()}
+        state |= {"reached": self.reached} if self.reached else {}
         checkpoint["forewarp"] = state
 
     def on_load_checkpoint(self, checkpoint: dict) -> None:
@@ -179,6 +181,7 @@ class DynamicSceneModule(lightning.LightningModule):
         torch.set_rng_state(self._torch_state)
         self.curriculum.load_state_dict(state["curriculum"])
         self.clock.load_state_dict(state["clock"])
+        self.reached = state.get("reached")
 
     def psnr_of(self, target: Target, pixels: Tensor | None = None) -> Tensor:
         """Return the PSNR (dB) of the best rendering of an image, or of its flat ``pixels`` (R,) alone; where

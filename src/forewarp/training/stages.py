@@ -9,7 +9,7 @@ import resource
 import sys
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 import lightning
@@ -26,6 +26,7 @@ from forewarp.training.loggers import RunLoggers
 from forewarp.training.module import DynamicSceneModule
 from forewarp.training.schedule import Curriculum, Stage
 from forewarp.training.sentinel import Sentinel
+from forewarp.training.stopping import StopRule
 
 _PROCESS = Path("/proc/self")  # Linux only
 
@@ -54,6 +55,7 @@ class Run:
         start: gives the fitted module of another run, from which the first stage begins, and what it left;
             None: the first stage begins from images.
         packages: whose code the run is of; ``done.json`` keeps their versions and commits.
+        target: what ends the last stage before its budget; whoever watches the run's views applies it.
     """
 
     datamodule: lightning.LightningDataModule
@@ -71,6 +73,7 @@ class Run:
     loggers: RunLoggers = field(default_factory=RunLoggers)
     start: Callable[[], tuple[DynamicSceneModule, Handover]] | None = None
     packages: Sequence[str] = ("forewarp",)
+    target: StopRule = StopRule()
 
     @property
     def device(self) -> torch.device:
@@ -251,6 +254,7 @@ class Run:
         if in_play < count and curriculum.iterations_per_time is not None:
             more = f"for all, set a larger budget, or stage.{name}.curriculum.iterations_per_time=null"
             self.tell(f"{name}: ended when {in_play} of {count} training images had come in; {more}")
+        target = self._target_of(stage, module)
         keeper.save(trainer)
         handover = checkpoints.make_handover(module.method, self.datamodule.scene, before, in_play)
         checkpoints.save_handover(handover, folder)
@@ -259,8 +263,25 @@ class Run:
         done |= {"frames_in_play": in_play, "peak_memory_bytes": peak_memory_bytes()}
         done |= {"skipped_steps": sentinel.skipped, "code": code, "versions": versions()}
         write_json(folder / "done.json", done)
+        done |= {"frames_in_play": in_play, "peak_memory_bytes": peak_memory_bytes(), **target}
+        write_json(folder / "done.json", done | {"skipped_steps": sentinel.skipped, "commit": code})
         if keeper.asked:  # pressed after the stage's last step
             raise KeyboardInterrupt
+
+    def _target_of(self, stage: Stage, module: DynamicSceneModule) -> dict:
+        """Say whether the target was reached, and when; return it for the last stage's ``done.json``."""
+        if stage is not self.stages[-1] or not self.target.is_set:
+            return {}
+        target, name = asdict(self.target), stage.settings.name
+        known, got = ", ".join(f"target.{key}={dB:g}" for key, dB in target.items() if dB), module.reached
+        if got is None:
+            self.tell(f"{name}: {known} not reached within the budget")
+            got = dict.fromkeys(("reached", "seconds", "step", "held_out_psnr"))
+        else:
+            when = f"at {got['seconds']:.1f} s of training, step {got['step']:,} of the stage"
+            psnr = f"with {got['held_out_psnr']:.2f} dB of views not trained on"
+            self.tell(f"{name}: {got['reached']} reached {when}, {psnr} ({known})")
+        return {"target": target | got}
 
 
 def _done(folder: Path) -> dict | None:
