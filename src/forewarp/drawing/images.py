@@ -49,9 +49,9 @@ def hues(turns: Tensor) -> Tensor:
 def depth_colors(depth: Tensor, opacity: Tensor, ends: tuple[float, float] | None = None) -> Tensor:
     """Draw depth (H, W) over white, near bright, with its scale in the lower right corner, in world units.
 
-    The scale spans ``ends``; None: those of ``depth_ends``. A small image has none.
+    The scale spans the image's own ends. A small image has none, nor one whose ``ends`` are given.
     """
-    ends = ends or depth_ends(depth, opacity)
+    bare, ends = ends is not None, ends or depth_ends(depth, opacity)
     if ends is None:
         return depth.new_ones(*depth.shape, 3)
     near, far = ends
@@ -59,7 +59,7 @@ def depth_colors(depth: Tensor, opacity: Tensor, ends: tuple[float, float] | Non
     colors = torch.lerp(torch.ones_like(colors), colors, opacity[..., None].clamp(0, 1))
     scale = at_least(depth_scale(near, far), _LINE * max(2, min(depth.shape) // 100)).to(colors)
     height, width = scale.shape[:2]
-    if height < depth.shape[0] and width < depth.shape[1]:
+    if not bare and height < depth.shape[0] and width < depth.shape[1]:
         colors[-height:, -width:] = scale
     return colors
 

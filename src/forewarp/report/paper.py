@@ -477,7 +477,7 @@ def _figures(
 
 def _rivals(runs: Runs, name: str, order: Iterable[str]) -> dict[str, Row]:
     """Choose runs of one seed and budget to stand beside each other, where there are most: label -> row. A
-    label is what ``name`` says, and the run's setting.
+    label is what ``name`` says, and the run's setting where several are there.
 
     Args:
         runs: of one scene.
@@ -489,7 +489,8 @@ def _rivals(runs: Runs, name: str, order: Iterable[str]) -> dict[str, Row]:
     places = {value: place for place, value in enumerate(order)}
     found = {}
     for run in sorted(most, key=lambda run: places.get(run[name], len(places))):
-        found[" ".join([run[name], *run["words"].values()])] = run
+        several = len(most.where(**{name: run[name]}).by("setting")) > 1
+        found[" ".join([run[name], *(run["words"].values() if several else ())])] = run
     return found
 
 
