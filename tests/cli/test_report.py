@@ -2,7 +2,7 @@ import pytest
 
 from tests.support.runs_on_disk import write_run
 
-KINDS = "accuracy_time, price_list, paper, ablation, minutes, methods, effects, search, compare, run"
+KINDS = "accuracy_time, price_list, paper, ablation, minutes, methods, effects, search, table, compare, run"
 
 
 def test_pages_are_written_and_named(ok, in_tmp):

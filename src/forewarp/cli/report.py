@@ -9,7 +9,8 @@ forewarp-report makes tables, curves and pages of runs that are already there. O
   kind=methods        all methods under one clock: what each reaches, PSNR against seconds, views side by side
   kind=effects        planned runs beside the preset, every effect and none
   kind=search         the trials of a search, the best first: what was chosen, score, steps, seconds
-  kind=compare        a few runs side by side, printed, and with out=FOLDER drawn
+  kind=table          any runs as one table, printed, and as Markdown, LaTeX and CSV
+  kind=compare        a few runs side by side, seeds as one, printed, and with out=FOLDER drawn
   kind=run            the page of one run: its video, views, why it is not better and what to try
 
   forewarp-report kind=price_list runs=FOLDER out=FOLDER
@@ -19,7 +20,11 @@ forewarp-report makes tables, curves and pages of runs that are already there. O
 What one types most:
   runs=FOLDER            searched for runs (runs/accuracy_time, minutes, effects, search, ..., else paper)
   runs=FILE.csv          a page's own table: write it anew (ablation, effects, methods, minutes, price_list)
-  runs=[FOLDER,FOLDER]   compare: the runs themselves; patterns with * are expanded
+  runs=[FOLDER,FOLDER]   compare: the runs themselves; table: folders to search; patterns with * are expanded
+  rows=NAMES columns=NAMES   table: model, preset, scene, dataset, minutes, variant, or a key of config.yaml
+                         or its last parts (rows=model,rigid); a cell is a mean over seeds and of nothing else
+  metric=NAMES           table: psnr,lpips,space/psnr, your own; costs: train, step, frame, memory, bytes, ...
+  pareto=true            table: draw the first metric against seconds, memory and bytes
   out=FOLDER             where the page goes (results/ below the runs); compare: where the picture goes
   target=DB              accuracy_time: PSNR that every variant's seconds are listed for
   published=FILE         accuracy_time, minutes: results of others; paper, ablation: the printed numbers
@@ -69,13 +74,15 @@ MOST_VIEWS = 64  # of which pixels are looked at
 
 def report(config: DictConfig) -> None:
     """Write the page, or print the table."""
-    one_of(config.kind, "kind", *KINDS, "compare", "run")
+    one_of(config.kind, "kind", *KINDS, "table", "compare", "run")
     if not isinstance(config.target, int | float | None):
         raise ValueError(f"target: expected a number of dB or null, but got '{config.target}'")
     if config.kind == "run":
         print(run_page(config))
     elif config.kind == "compare":
         print(compared(config))
+    elif config.kind == "table":
+        print(tabled(config))
     elif not isinstance(config.runs, str | None):
         raise ValueError(f"runs: expected one folder for kind={config.kind}, but got a list; name one folder")
     else:
@@ -89,6 +96,26 @@ def report(config: DictConfig) -> None:
         print(*(f"written: {file}" for file in write(runs, out, **options)), sep="\n")
 
 
+def tabled(config: DictConfig) -> str:
+    """Write the files of ``kind=table``; return the table and their names."""
+    from forewarp.report.table import write_table
+
+    one_of(config.pareto, "pareto", True, False)
+    named = listed(config.runs) or [config.paths.runs]
+    folders = [Path(folder) for name in named for folder in sorted(glob(name)) or [name]]
+    names = {key: listed(config[name]) for key, name in (("rows", "rows"), ("columns", "columns"))}
+    names["metrics"] = listed(config.metric) or ["psnr"]
+    out = Path(config.out or (folders[0] if len(folders) == 1 else Path(config.paths.runs)) / "results")
+    text, written = write_table(folders, out, pareto=config.pareto, **names)
+    return "\n".join([text, *(f"written: {file}" for file in written)])
+
+
+def listed(names: object) -> list[str]:
+    """List names that were typed as one, with commas between them, or as a list; null is none."""
+    given = names.split(",") if isinstance(names, str) else list(names or ())
+    return [str(name).strip() for name in given]
+
+
 def compared(config: DictConfig) -> str:
     """Return the table of ``kind=compare``; draw a view by each run where ``out`` is set."""
     from forewarp.report.choices import compare
@@ -96,12 +123,13 @@ def compared(config: DictConfig) -> str:
     from forewarp.report.results import read_compared
 
     named = [config.runs] if isinstance(config.runs, str) else list(config.runs or ())
-    runs = read_compared([folder for name in named for folder in sorted(glob(str(name))) or [str(name)]])
-    compared_runs = compare(runs)
+    groups = read_compared([folder for name in named for folder in sorted(glob(str(name))) or [str(name)]])
+    compared_runs = compare(groups)
     table = "\n".join(filter(None, [compared_runs.plain(), compared_runs.caption]))
     if not config.out:
         return table
-    drawn = draw_beside(Path(config.out) / "compare.png", runs, 0.5, "test view")
+    first = {name: own[0] for name, own in groups.items()}
+    drawn = draw_beside(Path(config.out) / "compare.png", first, 0.5, "test view")
     none = "no image: the runs share no test view with a sheet; type views= and sheets= alike"
     return f"{table}\n{f'written: {drawn}' if drawn else none}"
 

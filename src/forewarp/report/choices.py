@@ -8,8 +8,9 @@ from __future__ import annotations
 import math
 import re
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from itertools import chain, count
 from pathlib import Path
 from statistics import mode
@@ -20,9 +21,9 @@ from forewarp.report.benchmark import read_published
 from forewarp.report.figures import draw_scene
 from forewarp.report.results import KINDS, PLACES, Point, Row, Runs, in_words, nothing, read_runs
 from forewarp.report.settings import CONDITIONS, family_of, words_of
-from forewarp.report.statistics import FACTORS, Estimate, by_chance, paired_change, verdict
+from forewarp.report.statistics import FACTORS, INTERVALS, Estimate, by_chance, paired_change, verdict
 from forewarp.report.stored import read_any, stored_csv
-from forewarp.report.tables import Column, Difference, Table, rendered, score_columns
+from forewarp.report.tables import Column, Table, rendered, score_columns
 
 COSTS = {"epe": Column("EPE", 4), "step": Column("s/step", 3), "frame": Column("s/frame")}
 COSTS |= {"memory": Column("GiB"), "parameters": Column("parameters (M)", 3), "steps": Column("steps", 0)}
@@ -341,43 +342,70 @@ SHOWN_CONDITIONS |= {"clock": "clock of the minutes", "threads": "threads", "dev
 SHOWN_CONDITIONS |= {"pictures": "pictures", "measured": "test views", "held_out": "views held out"}
 
 
-def compare(runs: dict[str, Row]) -> Table:
-    """Make a table with a row for each measure that all runs have, and a column for each run.
+def compare(groups: Mapping[str, Runs]) -> Table:
+    """Make a table with a row for each measure that all runs have, and a column for each group of seeds.
 
-    Metrics are those of the test views; for two runs a column with the difference is added, which is empty
-    where they are of different scenes or views. Conditions in which the runs differ come last. The caption
-    says why there are no differences, or no metrics.
+    Metrics are those of the test views; for two groups a column with the difference is added, in pairs by
+    seed where both have the same seeds. It is empty where they are of different scenes or views. Conditions
+    in which the groups differ come last. The caption says why there are no differences, or no metrics.
 
     Args:
-        runs: as of ``results.read_compared``.
+        groups: as of ``results.read_compared``.
     """
-    rows, lines, two = list(runs.values()), [], len(runs) == 2
+    lines, two, rows = [], len(groups) == 2, [own[0] for own in groups.values()]
     same_scene = len({(row["dataset"], row["scene"]) for row in rows}) == 1
     same_views = same_scene and len({row["measured"] for row in rows}) == 1
+    seeds = [sorted(row["seed"] for row in own) for own in groups.values()]
 
-    def add(name: str, values: list, digits: int, with_difference: bool = False) -> None:
-        if None not in values:
-            column = Column("", digits)
-            difference = column.text(Difference(values[0] - values[-1])) if with_difference else None
-            lines.append([name, *(column.text(float(value)) for value in values), *[difference] * two])
+    def add(
+        name: str, value: Callable[[Row], float | None], digits: int, with_difference: bool = False
+    ) -> None:
+        values = [[value(row) for row in own] for own in groups.values()]
+        if any(None in own for own in values):
+            return
+        column, difference = Column("", digits), None
+        if with_difference and two:
+            by_seed = [dict(zip((r["seed"] for r in own), v)) for own, v in zip(groups.values(), values)]
+            shared = [seed for seed in by_seed[0] if seed in by_seed[1]]
+            alone = len(values[0]) == len(values[1]) == 1  # whatever their seeds
+            changes = [by_seed[0][seed] - by_seed[1][seed] for seed in shared]
+            difference = Estimate.of([values[0][0] - values[1][0]] if alone else changes)
+        told = None if difference is None else replace(column, signed=True).text(difference)
+        lines.append([name, *(column.text(Estimate.of(own)) for own in values), *[told] * two])
 
-    added = (name for row in rows for scores in row["test"].values() for name in scores)
+    every = [row for own in groups.values() for row in own]
+    added = (name for row in every for scores in row["test"].values() for name in scores)
     for metric in map(metric_of, dict.fromkeys([*METRICS, *added])):
         for kind, words in KINDS.items() if metric.summary else ():
             name = words if metric.name == "psnr" else f"{metric.heading}, {words}"
-            values = [row["test"].get(kind, {}).get(metric.name) for row in rows]
-            add(name, values, metric.digits, same_views)
-    shares = [None if row["motion_error"] is None else 100 * row["motion_error"] for row in rows]
-    add("moving points' error, % of motion", shares, 0, same_scene)
+            add(name, partial(_score, kind, metric.name), metric.digits, same_views)
+    add("moving points' error, % of motion", _motion_share, 0, same_scene)
     for name, (words, digits) in MEASURED.items():
-        add(words, [row[name] or None for row in rows], digits)
+        add(words, partial(_measured, name), digits)
     for name, words in SHOWN_CONDITIONS.items():
         absent = "all" if name == "train_views" else "none named"
         values = [absent if row[name] is None else str(row[name]) for row in rows]
         lines += [[words, *values, *[None] * two]] if len(set(values)) > 1 else []
     told = [f"no differences: the runs are of different {'test views' if same_scene else 'scenes'}"]
     told = told if two and not same_views else []
-    if not set.intersection(*(set(row["test"]) for row in rows)):
-        kinds = (f"{name}: {', '.join(row['test']) or 'none'}" for name, row in runs.items())
+    if max(map(len, seeds)) > 1:
+        listed = "; ".join(f"{name}: seeds {', '.join(map(str, own))}" for name, own in zip(groups, seeds))
+        told.append(f"{INTERVALS}; {listed}")
+        if two and same_views:
+            told.append("differences are paired by seed")
+    if not set.intersection(*(set(row["test"]) for row in every)):
+        kinds = (f"{name}: {', '.join(own[0]['test']) or 'none'}" for name, own in groups.items())
         told.append(f"no metrics: no kind of test view was measured in all runs ({'; '.join(kinds)})")
-    return Table(["PSNR (dB) of test views", *runs, *["difference"] * two], lines, "\n".join(told))
+    return Table(["PSNR (dB) of test views", *groups, *["difference"] * two], lines, "\n".join(told))
+
+
+def _score(kind: str, metric: str, row: Row) -> float | None:
+    return row["test"].get(kind, {}).get(metric)
+
+
+def _motion_share(row: Row) -> float | None:
+    return None if row["motion_error"] is None else 100 * row["motion_error"]
+
+
+def _measured(name: str, row: Row) -> float | None:
+    return row[name] or None

@@ -25,6 +25,7 @@ from forewarp.files import MOST_CONFIG, load_json, read_json, read_rows, read_te
 from forewarp.metrics.registry import metric_of, take_described
 from forewarp.report.settings import (
     CONDITIONS,
+    SAME,
     configuration,
     grouped,
     key_of,
@@ -217,10 +218,30 @@ def read_runs(root: Path, needed: Sequence[str] = ("metrics.json",)) -> tuple[Ru
         do = "make some with forewarp-train, or set runs=..."
         raise ValueError(f"{root}: expected folders of runs, but got none; {do}")
     name_settings(runs)
+    return _without_repeated(runs, left_out, root)
+
+
+def _without_repeated(
+    runs: Runs, left_out: Sequence[str], root: Path | None = None
+) -> tuple[Runs, list[str]]:
+    """Leave out runs that were made again, and add a line for each."""
     older = {id(row) for row in repeated(runs)}
-    folders = [row["folder"].relative_to(root) for row in runs if id(row) in older]
-    left_out += [f"{folder}: another run of the same is newer" for folder in folders]
-    return Runs(row for row in runs if id(row) not in older), left_out
+    folders = [row["folder"] for row in runs if id(row) in older]
+    names = [folder if root is None else folder.relative_to(root) for folder in folders]
+    lines = [f"{name}: another run of the same is newer" for name in names]
+    return Runs(row for row in runs if id(row) not in older), [*left_out, *lines]
+
+
+def read_folders(roots: Sequence[Path]) -> tuple[Runs, list[str]]:
+    """Read all runs below several folders as ``read_runs`` does, and name them among all."""
+    runs, left_out = Runs(), []
+    for root in roots:
+        found, others = read_runs(root)
+        runs += found
+        left_out += [f"{root}: {line}" if len(roots) > 1 else line for line in others]
+    runs = Runs({row["folder"].resolve(): row for row in runs}.values())
+    name_settings(runs)
+    return _without_repeated(runs, left_out)
 
 
 def nothing(root: Path, runs: Sequence[Row], left_out: Sequence[str], takes: str, make: str) -> ValueError:
@@ -337,8 +358,9 @@ def read_run(folder: Path) -> Row:
     return row
 
 
-def read_compared(folders: Sequence[str | Path]) -> dict[str, Row]:
-    """Read runs, named by their methods if these differ, else by as much of their folders as needed.
+def read_compared(folders: Sequence[str | Path]) -> dict[str, Runs]:
+    """Read runs, those together that differ in the seed alone; name them by their methods if these differ,
+    else by their settings, or by as much of their folders as needed.
 
     Raises:
         ValueError: if there is no folder, or one that holds no measured run.
@@ -354,10 +376,18 @@ def read_compared(folders: Sequence[str | Path]) -> dict[str, Row]:
             raise ValueError(f"{numbers}: expected a run's numbers, but got none; make them with {again}")
         with refused(f"{path}: expected a measured run, but got ", f"; measure it with {again}"):
             rows.append(read_run(path))
-    methods = [row["metrics"].get("protocol", {}).get("method", path.name) for row, path in zip(rows, paths)]
-    folders, places = [path.resolve().name for path in paths], [path.as_posix() for path in paths]
-    choices = methods, folders, places, [f"{number} {place}" for number, place in enumerate(places, 1)]
-    return dict(zip(next(names for names in choices if len(set(names)) == len(names)), rows))
+    name_settings(rows)
+    again = {id(row) for row in repeated(rows)}  # what is named twice stands beside itself
+    apart = grouped(((key_of(row, (*SAME, "setting")), id(row) in again), row) for row in rows)
+    groups = [Runs(sorted(own, key=lambda row: row["seed"])) for own in apart.values()]
+    methods = [own[0]["metrics"].get("protocol", {}).get("method", own[0]["folder"].name) for own in groups]
+    places = [own[0]["folder"].as_posix() for own in groups]
+    names = [own[0]["folder"].resolve().name for own in groups]
+    settings = [own[0]["variant"] for own in groups]
+    scenes = [f"{own[0]['scene']} {variant}" for own, variant in zip(groups, settings)]
+    choices = [methods, settings, scenes] if len(groups) < len(rows) else [methods, names]
+    choices += [places, [f"{number} {place}" for number, place in enumerate(places, 1)]]
+    return dict(zip(next(names for names in choices if len(set(names)) == len(names)), groups))
 
 
 def read_points(folder: Path) -> tuple[Point, ...]:

@@ -203,9 +203,18 @@ def _word(key: str, value: object) -> dict[str, str]:
     >>> _word("model.upsampler._target_", "theirs.parts.Learned"), _word("model.blur", 2.0)
     ({'model.upsampler': 'model.upsampler=Learned'}, {'model.blur': 'model.blur=2'})
     """
-    name, is_whole = key.removesuffix("._target_"), isinstance(value, float) and value.is_integer()
-    text = "null" if value is None else str(int(value)) if is_whole else "".join(str(value).split())
-    return {name: f"{name}={text.rpartition('.')[2] if name != key else text}"}
+    name = key.removesuffix("._target_")
+    text = value_text(name, {key: value})
+    return {name: f"{name}={''.join(text.split())}"}
+
+
+def value_text(key: str, own: Mapping[str, object]) -> str:
+    """Write the value of a key of a configuration; of a class its name, and null where there is none."""
+    if (target := own.get(f"{key}._target_")) is not None:
+        return str(target).rpartition(".")[2]
+    value = own.get(key)
+    is_whole = isinstance(value, float) and value.is_integer()
+    return "null" if value is None else str(int(value)) if is_whole else str(value)
 
 
 def _identity(row: Row) -> object:

@@ -11,9 +11,9 @@ from contextlib import suppress
 # Keys that hold a path, or the name of a scene's folder; those in which a list of paths may stand.
 TEXTS = re.compile(
     r"data\.(root|scene)|paths\.\w+|plan\.folder|run2?|runs|resume|start|out|videos?|images|colmap|masks|curves|"
-    "published|lpips_weights"
+    "published|lpips_weights|rows|columns|metric"
 )
-LISTS = ("runs", "published", "lpips_weights")
+LISTS = ("runs", "published", "lpips_weights", "rows", "columns", "metric")
 constant: set[str] = set()  # keys that were typed with one value, which tell no jobs of a sweep apart
 OF_A_SWEEP = ("sweeps=", "seeds=", "launcher=")  # these say how jobs are run, not what a job computes
 
