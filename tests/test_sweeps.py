@@ -14,6 +14,7 @@ from omegaconf import OmegaConf
 
 from forewarp.methods.particles.options import EFFECTS
 from forewarp.methods.voxel.structure import NAMES
+from forewarp.report import settings
 from forewarp.runs.build import build_run
 from forewarp.runs.config import hashed
 from forewarp.runs.overrides import key_of, merged
@@ -171,14 +172,14 @@ def test_the_price_list_changes_one_thing_at_a_time(method, count):
     assert [job[:2] for job in jobs[2:4]] == [[f"seed={seed}", "budget.minutes=3"] for seed in (0, 1)]
 
 
-def test_a_job_is_named_by_what_was_typed_but_not_by_how_it_runs(forewarp, in_tmp):
+def test_a_job_is_named_by_what_was_typed_but_not_by_how_it_runs():
     scene = ["data=dnerf", "data.root=nowhere", "data.scene=x", "seed=3", "budget.minutes=2"]
     how = ["checkpoint_seconds=9", "score=ssim", "evaluate=false", "sentinel.skip=1", "trust=[x]"]
     how += [f"callbacks{word}" for word in (".pictures=null", ".accuracy=null")]
     how += ["absent=skip", "data_changed=accept"]
-    typed = ["model/motion=cosines", "stage.fine.density=45"]
-    words = ["sweeps=price_list_particles", *scene, *how, *typed, "--cfg", "job", "--resolve"]
-    assert yaml.safe_load(forewarp("train", *words).out)["variant"] == {"name": " ".join(typed)}
+    words = ["model/motion=cosines", "stage.fine.density=45"]
+    command = shlex.join(["forewarp-train", "sweeps=price_list_particles", *scene, *how, *words])
+    assert list(settings.typed(command).values()) == words
 
 
 @pytest.mark.slow

@@ -125,7 +125,7 @@ def test_what_does_not_count(tmp_path):
     known = {key.split(".")[0] for key in NOT_COUNTED} - {"data", "trainer"}
     elsewhere = {"paths", "logger", "variant", "capture"}  # groups, and the key of ablations
     assert known - elsewhere <= train
-    counted = {"defaults", "start", "target", "budget", "sentinel", "callbacks", "hydra"}
+    counted = {"defaults", "start", "target", "budget", "hydra"}
     assert train - known - counted == set()
     config = {"seed": 3, "run": "a", "data": {"scene": "x", "root": "/a", "seed": 3}, "stage": None}
     config |= {"callbacks": {"scalars": {"_target_": "forewarp.training.callbacks.Scalars", "every": 20}}}

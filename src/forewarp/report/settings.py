@@ -16,7 +16,7 @@ from contextlib import suppress
 Row = dict
 
 # Keys of a run's config.yaml that change neither what is computed nor how it is measured, and why. All others
-# count, those of other packages too; so does a callback of another package.
+# count, those of other packages too.
 NOT_COUNTED = {
     "seed": "what repetitions differ in",
     "seeds": "how many jobs a sweep has",
@@ -30,6 +30,8 @@ NOT_COUNTED = {
     **dict.fromkeys(("evaluate", "score", "lpips_weights"), "what is measured, not how"),
     **dict.fromkeys(("checkpoint_seconds", "resume", "trust", "absent", "data_changed"), "how the job runs"),
     "plan_only": "such a run is not made",
+    "sentinel.skip": "how many broken steps may be",
+    "callbacks": "ours only watch; those of other packages count",
     **dict.fromkeys(("command", "variant", "debug"), "names; a debug run is left out as a whole"),
     **dict.fromkeys(("capture", "effects", "plan", "planned"), "what chose the effects, which count"),
 }
@@ -83,7 +85,6 @@ def configuration(config: Mapping, files: object = None) -> dict[str, object]:
         files: the fingerprint of the scene's files, if there is one.
     """
     found = {key: value for key, value in flat(config) if counts(key) and value is not None}
-    found = {key: value for key, value in found.items() if not key.startswith("callbacks.")}
     for name, callback in (config.get("callbacks") or {}).items():
         if callback and not str(callback.get("_target_")).startswith(WATCHERS):
             found |= {f"callbacks.{name}.{key}": value for key, value in flat(callback)}
