@@ -26,7 +26,7 @@ NOT_COUNTED = {
     **dict.fromkeys(("data.cache_bytes", "data.disk_cache_bytes"), "memory, and no frame"),
     **dict.fromkeys(("trainer.accelerator", "trainer.devices", "threads"), "the protocol says what computed"),
     **dict.fromkeys(("views", "reduce"), "the protocol says which views were measured, and how large"),
-    **dict.fromkeys(("logger", "viewer", "host", "port", "sheets"), "what is shown meanwhile"),
+    **dict.fromkeys(("logger", "trackers", "viewer", "host", "port", "sheets"), "what is shown"),
     **dict.fromkeys(("evaluate", "score", "lpips_weights"), "what is measured, not how"),
     **dict.fromkeys(("checkpoint_seconds", "resume", "trust", "absent", "data_changed"), "how the job runs"),
     "plan_only": "such a run is not made",
