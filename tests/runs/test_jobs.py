@@ -53,8 +53,8 @@ def test_changes_and_scenes_are_one_at_a_time(sweep):
 
 
 def test_a_sweep_is_told_by_its_jobs_in_a_few_lines_and_listed(sweep, monkeypatch, tmp_path):
-    config = sweep(*SMALL, "model=particles,forward", f"paths.runs={tmp_path}")
-    done = tmp_path / "vehicle" / "forward-demo-seed0"
+    config = sweep(*SMALL, "model=particles,forward", f"run={tmp_path}/runs/${{model.name}}")
+    done = tmp_path / "runs" / "forward"
     for name in ("coarse", "fine"):
         (done / name).mkdir(parents=True)
         (done / name / "done.json").write_text("{}")
@@ -65,8 +65,8 @@ def test_a_sweep_is_told_by_its_jobs_in_a_few_lines_and_listed(sweep, monkeypatc
     assert lines[0] == "2 jobs: 1 finished before, 1 to do"
     assert whole.training == pytest.approx(60.0)
     assert lines[-1] == f"   finished  {done}"
-    assert lines[-2].endswith(f"  {tmp_path / 'vehicle' / 'particles-demo-seed0'}")
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["vehicle"]
+    assert lines[-2].endswith(f"  {tmp_path / 'runs' / 'particles'}")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["runs"]
 
 
 def test_a_search_has_as_many_jobs_as_it_is_given(sweep):
