@@ -100,7 +100,7 @@ def jobs_of(config: DictConfig) -> Iterator[DictConfig]:
     Raises:
         HydraException, OmegaConfBaseException: if a job cannot be composed.
     """
-    composed, mode = {}, [*config.hydra.overrides.hydra]
+    composed, mode = {}, OmegaConf.to_container(config.hydra.overrides.hydra)  # ${..} as typed
     for of_job in _crossed(config) or ():
         seed = [override for override in of_job if key_of(override) == "seed"]
         rest = tuple(override for override in of_job if override not in seed)
@@ -155,7 +155,7 @@ def _crossed(config: DictConfig) -> Sequence[Sequence[str]] | None:
     lists = {key: sweeper[key] for key in ("changes", "scenes") if key in sweeper}
     params = [f"{key}={value}" for key, value in (sweeper.get("params") or {}).items()]
     parser = OverridesParser.create(config_loader=GlobalHydra.instance().config_loader())
-    typed = parser.parse_overrides([*params, *config.hydra.overrides.task])
+    typed = parser.parse_overrides([*params, *OmegaConf.to_container(config.hydra.overrides.task)])
     (jobs,) = OneAtATime(None, **lists).split_arguments(typed, None)
     return jobs
 
