@@ -144,6 +144,13 @@ def test_what_does_not_count(tmp_path):
     assert configuration({"seed": 0, "start": "x-seed0/still"}) == configuration(
         {"seed": 1, "start": "x-seed1/still"}
     )
+    drawn = [{"root": f"/a/seed{seed}", "synthesis": {"seed": seed}} for seed in (0, 1)]
+    specimens = [
+        configuration({"seed": n, "data": data}, {"texts": {"a": n}}) for n, data in enumerate(drawn)
+    ]
+    assert specimens == [{}, {}]  # whose cameras are other ones for each seed
+    fixed = [configuration({"seed": n, "data": {"root": "/a", "synthesis": {"seed": 0}}}) for n in (0, 1)]
+    assert fixed == [{"data.synthesis.seed": 0.0}] * 2
     assert configuration(config, {"texts": {}}) != configuration(config, {"texts": {"a": "b"}}) != own
 
 

@@ -7,6 +7,7 @@ by the fewest keys that do.
 
 from __future__ import annotations
 
+import hashlib
 import json
 import re
 import shlex
@@ -90,6 +91,9 @@ def configuration(config: Mapping, files: object = None) -> dict[str, object]:
             found |= {f"callbacks.{name}.{key}": value for key, value in flat(callback)}
     if found.get("data.seed") == config.get("seed"):
         found.pop("data.seed", None)
+    if _is_drawn_anew(config):
+        found.pop("data.synthesis.seed")
+        files = None
     if start := found.get("start"):  # of the same seed, where windows of a film have several
         found["start"] = re.sub(rf"seed{config.get('seed')}\b", "seed", str(start))
     for name, stage in (config.get("stage") or {}).items():  # repeats objective.<name>
@@ -100,8 +104,17 @@ def configuration(config: Mapping, files: object = None) -> dict[str, object]:
         found = {key: value for key, value in found.items() if not decided.match(key)}
         found |= typed(str(config.get("command")))
     if files:
-        found["data.files"] = json.dumps(files, sort_keys=True)
+        found["data.files"] = hashlib.sha256(json.dumps(files, sort_keys=True).encode()).hexdigest()[:8]
     return found
+
+
+def _is_drawn_anew(config: Mapping) -> bool:
+    """Tell whether a procedural scene has other cameras for each seed, as specimens have: its folder is named
+    by the seed.
+    """
+    data, seed = config.get("data") or {}, config.get("seed")
+    is_named = re.search(rf"seed{seed}\b", str(data.get("root"))) is not None
+    return is_named and (data.get("synthesis") or {}).get("seed") == seed
 
 
 def flat(content: object, key: str = "") -> Iterator[tuple[str, object]]:
