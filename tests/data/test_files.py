@@ -186,7 +186,7 @@ def test_what_only_begins_as_an_archive_is_refused_and_closed(tmp_path):
 
 
 def test_files_are_bounded_by_their_size(tmp_path, monkeypatch):
-    monkeypatch.setattr("forewarp.data.arrays.MOST_ARRAYS", 1 << 20)
+    monkeypatch.setattr("forewarp.files.MOST_ARRAYS", 1 << 20)
     with zipfile.ZipFile(tmp_path / "b.npz", "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("points.npy", bytes(1 << 20) + b"x")
     promise = io.BytesIO()  # a header that promises more than the file holds
