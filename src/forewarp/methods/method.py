@@ -181,7 +181,7 @@ class Method(nn.Module):
         return {name: "; ".join(notes) for name, notes in about.items() if notes}
 
     def outlines(self) -> dict[str, list[dict]]:
-        """Return by name the steps of networks that pages draw, as ``ops.outline`` lists them."""
+        """Return by name the steps of networks that pages draw, as ``fields.outline`` lists them."""
         return {}
 
     @property

@@ -379,7 +379,7 @@ def enlarged(picture: np.ndarray, width: int) -> np.ndarray:
 
 
 def draw_network(path: Path, steps: Sequence[Mapping]) -> Path:
-    """Draw a network from the list of its steps that a run's ``networks.json`` has (see ``ops.outline``).
+    """Draw a network from the list of its steps that a run's ``networks.json`` has (see ``fields.outline``).
 
     A box is a volume, the lower the smaller, and as wide as it has channels (the number above). An arrow is
     one or several steps, a dashed one goes to where volumes are joined. N voxels along a side are given.

@@ -260,11 +260,9 @@ class Run:
         checkpoints.save_handover(handover, folder)
         clock, steps, parameters = module.clock, module.global_step, parameter_count(module.method)
         done = {"seconds": clock.seconds, "clocks": clock.every, "steps": steps, "parameters": parameters}
-        done |= {"frames_in_play": in_play, "peak_memory_bytes": peak_memory_bytes()}
+        done |= {"frames_in_play": in_play, "peak_memory_bytes": peak_memory_bytes(), **target}
         done |= {"skipped_steps": sentinel.skipped, "code": code, "versions": versions()}
         write_json(folder / "done.json", done)
-        done |= {"frames_in_play": in_play, "peak_memory_bytes": peak_memory_bytes(), **target}
-        write_json(folder / "done.json", done | {"skipped_steps": sentinel.skipped, "commit": code})
         if keeper.asked:  # pressed after the stage's last step
             raise KeyboardInterrupt
 

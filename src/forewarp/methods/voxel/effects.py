@@ -15,11 +15,11 @@ from torch.utils.checkpoint import checkpoint
 from forewarp.fields.curves import TrajectoryField
 from forewarp.fields.grids import EMPTY, DirectRadiance, FieldAtTime, RadianceGrid, Shade
 from forewarp.fields.networks import mlp
+from forewarp.fields.outline import outline
 from forewarp.methods.method import FRACTION, check_least, check_number
 from forewarp.ops.backend import check_value
 from forewarp.ops.encode import encoded_size, positional_encoding, spherical_harmonics_1
 from forewarp.ops.grid import index_of, occupied_cells, trilinear
-from forewarp.ops.outline import outline
 from forewarp.ops.splat import average_splat, with_copies
 from forewarp.scene.box import Lattice
 
@@ -335,7 +335,7 @@ def filling(inputs: Tensor, crop: Crop, inpainter: nn.Module, upsampler: nn.Modu
 
 
 def outline_of(inpainter: UNet3d, upsampler: nn.Module | None, side: int = 64) -> list[dict]:
-    """List the steps of ``filling`` for a cube of ``side`` voxels (see ``ops.outline``)."""
+    """List the steps of ``filling`` for a cube of ``side`` voxels (see ``fields.outline``)."""
     parts = copy.deepcopy(nn.ModuleList(filter(None, (inpainter, upsampler)))).to("meta")
     for part in parts:
         part.recompute = False  # which would hide the steps

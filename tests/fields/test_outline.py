@@ -2,7 +2,7 @@ import torch
 from torch import nn
 from torch.nn import functional
 
-from forewarp.ops.outline import outline
+from forewarp.fields.outline import outline
 
 
 def test_steps_are_those_that_ran_and_lead_to_the_result():
