@@ -9,6 +9,7 @@ from forewarp.report.benchmark import Published
 from forewarp.report.figures import (
     GAP,
     MARGIN,
+    by_side,
     draw_details,
     draw_scene,
     pareto_front,
@@ -17,6 +18,7 @@ from forewarp.report.figures import (
     thirds,
 )
 from forewarp.report.results import read_runs
+from forewarp.report.settings import SAME
 from tests.support.runs_on_disk import write_run, write_views
 
 
@@ -140,3 +142,19 @@ def test_a_network_is_drawn_by_levels(tmp_path, monkeypatch):
     assert len([text for text in axis.texts if not text.get_text()]) == 5  # arrows, a skip among them
     legend = [text.get_text() for text in seen[0].legends[0].get_texts()]
     assert legend[:3] == ["convolution 3×3×3, ReLU", "max pooling", "interpolation"]
+
+
+def test_sizes_under_other_conditions_are_other_lines():
+    def run(side, held_out, psnr):
+        config = {"stage": {"fine": {"num_voxels": [[0, side**3]]}}}
+        about = dict.fromkeys((*SAME, "setting")) | {"scene": "s", "method": "m", "preset": "p", "seed": 0}
+        return about | {
+            "held_out": held_out,
+            "psnr": psnr,
+            "config": config,
+            "ablation": f"resolution {side}",
+        }
+
+    lines = by_side(run(side, held_out, side + held_out) for side in (16, 32) for held_out in (4, 8))
+    psnr = {label: [of["psnr"] for own in sides.values() for of in own] for label, sides in lines.items()}
+    assert psnr == {"s, m, p, 4 views held out": [20, 36], "s, m, p, 8 views held out": [24, 40]}

@@ -1,6 +1,7 @@
 """The paper's figures of motion and canonical shape, from hand-made run folders."""
 
 import csv
+import json
 
 import imageio.v3 as iio
 import numpy as np
@@ -8,13 +9,16 @@ import pytest
 
 from forewarp.report.motion_figures import (
     FILE,
+    ROW,
     TRUTH,
     Flows,
     arrays_of,
+    best_compared,
     common_times,
     draw_canonical,
     draw_trajectories,
     sections_of,
+    shape_table,
     variation_at,
 )
 from forewarp.report.paper import write_paper
@@ -173,3 +177,28 @@ def test_what_is_no_archive_is_refused_in_one_line(tmp_path, content):
     ) as error:
         arrays_of(Runs(runs_of(tmp_path))[0])
     assert "\n" not in str(error.value)
+
+
+def test_runs_under_other_conditions_are_no_seeds_of_a_row(tmp_path):
+    for held_out, error in ((0, 0.1), (8, 0.3)):
+        shape = dict.fromkeys(("chamfer", "accuracy", "completeness"), error)
+        made = motion_run(tmp_path / str(held_out), "forward", 0, canonical_shape=shape)
+        numbers = json.loads((made / "metrics.json").read_text())
+        numbers["protocol"]["held_out"] = held_out
+        (made / "metrics.json").write_text(json.dumps(numbers))
+    runs = runs_of(tmp_path)
+    rows = shape_table({"vehicle": runs}).rows
+    assert [(row[1], row[2].mean, row[2].count) for row in rows] == [
+        ("forward", 0.1, 1),
+        ("forward, 8 views held out", 0.3, 1),
+    ]
+
+
+def test_runs_that_are_drawn_together_share_all_conditions():
+    shared = dict.fromkeys((*ROW, "measured")) | {"seed": 0}
+    runs = [
+        shared | {"method": m, "held_out": n} for m, n in (("a", 8), ("b", 8), ("a", 0), ("c", 0), ("d", 0))
+    ]
+    assert {m: row["held_out"] for m, row in best_compared(Runs(runs)).items()} == {"a": 0, "c": 0, "d": 0}
+    twice = Runs(shared | {"method": "a", "folder": name} for name in "xy")
+    assert best_compared(twice)["a"]["folder"] == "x"

@@ -10,7 +10,8 @@ import numpy as np
 from PIL import Image
 
 from forewarp.files import written_whole
-from forewarp.report.results import Point, Row, Runs, pairs, read_points
+from forewarp.report.results import Point, Row, Runs, in_words, pairs, read_points
+from forewarp.report.settings import CONDITIONS, SAME
 
 NO_PLOTS = "expected matplotlib for plots; install forewarp[plots]"
 GAP = 4  # pixels between the parts of a sheet
@@ -466,6 +467,9 @@ def arrow_name(steps: Sequence[Mapping], group: Sequence[int]) -> str:
     return ", ".join(words)
 
 
+BUDGETS = {"minutes": "min", "iterations": "steps"}
+
+
 def by_side(rows: Iterable[Row]) -> dict[str, dict[int, Runs]]:
     """Gather runs of ``sweeps=resolution``: scene, method and budget -> voxels along a side -> runs, where
     there are two sizes.
@@ -474,11 +478,15 @@ def by_side(rows: Iterable[Row]) -> dict[str, dict[int, Runs]]:
     for row in (row for row in rows if row["psnr"] is not None):
         voxels = row["config"]["stage"]["fine"]["num_voxels"][-1][1]
         runs.append(row | {"side": round(voxels ** (1 / 3))})
-    for key, group in runs.by("scene", "method", "preset", "setting", "minutes", "iterations").items():
-        *names, minutes, steps = filter(lambda part: part != "", key)
-        budget = [f"{minutes:g} min"] * bool(minutes) + [f"{steps} steps"] * bool(steps)
-        sides = group.by("side")
-        lines |= {", ".join([*names, *budget]): sides} if len(sides) > 1 else {}
+    shared = [name for name in (*SAME, "setting") if name != "ablation"]  # which has the size
+    groups = [group for group in runs.by(*shared).values() if len(group.by("side")) > 1]
+    for group in groups:
+        row, others = group[0], [other[0] for other in groups]
+        alike = [other for other in others if all(other[n] == row[n] for n in ("scene", "method", "preset"))]
+        about = [row[name] for name in ("scene", "method", "preset", "setting") if row[name]]
+        about += [f"{row[name]:g} {unit}" for name, unit in BUDGETS.items() if row[name]]
+        about += in_words(row, alike, ["dataset", *(n for n in CONDITIONS if n != "iterations")])
+        lines[", ".join(about)] = group.by("side")
     return lines
 
 

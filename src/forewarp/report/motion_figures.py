@@ -10,7 +10,8 @@ import numpy as np
 from forewarp.files import MOST_ARRAYS, read_bytes, replace_file, unpack_arrays
 from forewarp.metrics.geometry import variation
 from forewarp.report.figures import COLORS, figure_of, save
-from forewarp.report.results import Row, Runs
+from forewarp.report.results import Row, Runs, in_words
+from forewarp.report.settings import CONDITIONS, SAME
 from forewarp.report.statistics import Estimate
 from forewarp.report.tables import Column, Section, Table
 
@@ -19,7 +20,7 @@ TRUTH = "true motion"
 WARPS = ("forward", "backward")  # whose flow the first figure draws
 SHAPES = ("forward", "dnerf", "ndvg", "tineuvox_s", "tineuvox_b", "backward", "particles")
 FOLLOWING = ("forward", "particles", "backward")
-ROW = ("method", "setting", "preset", "minutes", "iterations")  # what the runs of a row have in common
+ROW = (*SAME, "setting")  # what the runs of a row have in common
 DIRECTIONS = {"backward": "backward flow at the place", "forward": "forward flow of the point"}
 STYLES = {TRUTH: ("black", "-", "o"), "forward": (COLORS[0], "--", "s"), "backward": (COLORS[3], ":", "^")}
 MARKS = ("place", "o", 11, "#d01c8b"), ("point", "D", 8, "#0b5394")  # name, marker, size, colour
@@ -93,22 +94,25 @@ class Flows:
         at = [variation_at(self.truth[name], self.known) for name in DIRECTIONS]
         lines = [[scene, TRUTH, *at, *medians, int(self.known.sum()), None, None]]
         arrays = {id(row): of for row, of in self.runs}
-        by_method = Runs(row for row, _ in self.runs).by(*ROW)
-        for group in sorted(by_method.values(), key=_place):
+        runs = Runs(row for row, _ in self.runs)
+        for group in sorted(runs.by(*ROW).values(), key=_place):
             of_group = [[variation_at(arrays[id(r)].get(n), self.known) for r in group] for n in DIRECTIONS]
             stored = [row["metrics"].get("flow_variation", {}) for row in group]
             of_group += [[of.get(name) for of in stored] for name in DIRECTIONS]
             if all(value is None for values in of_group for value in values):
                 continue
             seeds = len({row["seed"] for row in group})
-            lines.append([scene, _name(group), *map(Estimate.of, of_group), int(self.known.sum()), seeds])
+            about = [scene, _name(group, runs)]
+            lines.append([*about, *map(Estimate.of, of_group), int(self.known.sum()), seeds])
             lines[-1].append(group.estimate("train"))
         return lines
 
 
-def _name(runs: Runs) -> str:
-    """Name the method of runs, and what tells them apart from others of it."""
-    return ", ".join(filter(None, (runs[0]["method"], runs[0]["setting"])))
+def _name(group: Runs, runs: Runs) -> str:
+    """Name the method of runs, and what tells them apart from the others of it among all."""
+    others = runs.where(method=group[0]["method"])
+    words = in_words(group[0], others, ("preset", "minutes", *CONDITIONS))
+    return ", ".join(filter(None, (group[0]["method"], group[0]["setting"], *words)))
 
 
 def _place(runs: Runs) -> int:
@@ -177,7 +181,9 @@ def shape_table(by_scene: Mapping[str, Runs]) -> Table:
         for group in sorted(known.by(*ROW).values(), key=_place):
             errors = [[row["metrics"]["canonical_shape"][name] for row in group] for name in names]
             seeds = len({row["seed"] for row in group})
-            lines.append([scene, _name(group), *map(Estimate.of, errors), seeds, group.estimate("train")])
+            lines.append(
+                [scene, _name(group, known), *map(Estimate.of, errors), seeds, group.estimate("train")]
+            )
     columns = ["scene", "method", *(Column(name, 4) for name in names)]
     caption = (
         "Chamfer distance to the true shape at the canonical time, in world units: the mean of both ways."
@@ -205,10 +211,8 @@ def _has(flows: Flows, methods: Sequence[str]) -> bool:
 
 def best_compared(runs: Runs) -> dict[str, Row]:
     """Choose one run of each method, all of one seed and budget: where most methods have a run."""
-    groups = runs.by(
-        "seed", "setting", "preset", "minutes", "iterations", "device", "threads", "clock"
-    ).values()
-    methods = [{row["method"]: row for row in group} for group in groups]
+    groups = runs.by("seed", *(name for name in ROW if name != "method")).values()
+    methods = [{row["method"]: row for row in reversed(group)} for group in groups]  # the first run stays
     return max(methods, key=len, default={})
 
 

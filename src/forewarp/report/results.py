@@ -33,7 +33,7 @@ from forewarp.report.settings import (
     repeated,
     words_of,
 )
-from forewarp.report.statistics import Estimate
+from forewarp.report.statistics import NETS, Estimate
 
 Row = dict
 
@@ -48,7 +48,6 @@ KINDS = {"space": "at training times", "time": "between training times", "canoni
 KINDS |= {"space_time": "of cameras and between times held out", "all": "all"}
 KINDS |= {"moving": "what moves", "still": "what is still"}
 COUNTERPART = "counterpart of "  # begins the dataset of synthetic scenes that stand in for its own
-NETS = ("vgg", "alex", "squeeze")  # LPIPS in tables is of the first whose weights were there
 # What pages tell of a run's protocol.
 PROTOCOL = ("half_resolution", "scale", "split", "frames", "views", "train_frames", "train_views")
 PROTOCOL += ("test_views", "test_cameras", "test_moments", "test_frames", "window", "measured", "held_out")

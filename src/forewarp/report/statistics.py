@@ -9,12 +9,14 @@ import math
 import statistics
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 
 from scipy.special import stdtrit
 
 LEVEL = 0.95  # of intervals
 LEAST = 3  # independent values that a verdict needs
 FACTORS = ("step", "frame", "memory", "parameters", "steps")  # measures that change by a factor
+NETS = ("vgg", "alex", "squeeze")  # LPIPS in tables is of the first whose weights were there
 SEEDS = ("no pair", "one seed", "two seeds")  # in place of a verdict
 INTERVALS = "± is half the 95 % confidence interval of a mean (Student's t over the seeds)"
 INTERVALS += "; of two seeds both values are in brackets"
@@ -73,14 +75,14 @@ class Estimate:
             return (self.deviation or 0.0) / math.sqrt(2)
         return self.half_width
 
-    def half_width_among(self, questions: int) -> float | None:
+    def half_width_among(self, questions: float) -> float | None:
         """Half the interval whose errors, 5 % in all, so many questions share (Bonferroni)."""
         if self.deviation is None:
             return None
         quantile = stdtrit(self.count - 1, 1 - (1 - LEVEL) / 2 / questions)
         return float(quantile) * self.deviation / math.sqrt(self.count)
 
-    def sign(self, questions: int = 1) -> int | None:
+    def sign(self, questions: float = 1) -> int | None:
         """Return 1 or -1 where the interval leaves out 0, above or below it, else 0; None if the values are
         fewer than ``LEAST``.
 
@@ -94,6 +96,33 @@ class Estimate:
         return 1 if self.mean > 0 else -1
 
 
+@dataclass(frozen=True)
+class Factor(Estimate):
+    """A geometric mean of quotients; ``deviation`` and ``half_width`` are of their natural logarithms.
+
+    A quotient and its inverse are so judged alike.
+    """
+
+    @classmethod
+    def of(cls, values: Iterable[float | None]) -> Factor | None:
+        """Estimate from the quotients that are not None; None if there are none.
+
+        >>> Factor.of([0.5, 2.0]).mean, Factor.of([4.0, 4.0, 4.0]).sign(), Factor.of([0.5, 2.0, 1.0]).sign()
+        (1.0, 1, 0)
+        """
+        logs = Estimate.of(None if value is None else math.log(value) for value in values)
+        return logs and cls(math.exp(logs.mean), logs.deviation, logs.count)
+
+    @property
+    def ends(self) -> tuple[float, float]:
+        """The ends of the 95 % interval, of two quotients both."""
+        return self.mean / math.exp(self.error_bar), self.mean * math.exp(self.error_bar)
+
+    def sign(self, questions: float = 1) -> int | None:
+        """Return 1 or -1 where the interval leaves out 1, as ``Estimate.sign`` does of 0."""
+        return Estimate(math.log(self.mean), self.deviation, self.count).sign(questions)
+
+
 def paired_change(pairs: Sequence[tuple[Mapping, Mapping]], measure: str) -> Estimate | None:
     """Estimate the change of a measure over pairs of runs (now, before) that are equal in all else.
 
@@ -103,21 +132,24 @@ def paired_change(pairs: Sequence[tuple[Mapping, Mapping]], measure: str) -> Est
 
     Args:
         pairs: rows, one pair a seed (and scene); pairs without the measure are left out.
-        measure: name; if in ``FACTORS`` the change is a quotient, else a difference.
+        measure: name; if in ``FACTORS`` the change is a ``Factor``, else a difference.
 
     >>> paired_change([({"psnr": 31.0, "step": 0.2}, {"psnr": 30.0, "step": 0.1})], "step")
-    Estimate(mean=2.0, deviation=None, count=1)
+    Factor(mean=2.0, deviation=None, count=1)
     """
     both = [(now, before) for now, before in pairs if None not in (now.get(measure), before.get(measure))]
     if measure in FACTORS:
-        return Estimate.of(now[measure] / before[measure] for now, before in both if before[measure])
+        positive = ((now[measure], before[measure]) for now, before in both)
+        return Factor.of(now / before for now, before in positive if now > 0 and before > 0)
     return Estimate.of(_difference(now, before, measure) for now, before in both)
 
 
 def _difference(now: Mapping, before: Mapping, measure: str) -> float:
-    ours, theirs = _by_view(now, measure), _by_view(before, measure)
-    if shared := [view for view in ours if view in theirs]:
-        return statistics.fmean(ours[view] - theirs[view] for view in shared)
+    # Views have LPIPS by the names of nets; a row has that of the first net.
+    for name in [f"lpips_{net}" for net in NETS] if measure == "lpips" else [measure]:
+        ours, theirs = _by_view(now, name), _by_view(before, name)
+        if shared := [view for view in ours if view in theirs]:
+            return statistics.fmean(ours[view] - theirs[view] for view in shared)
     return now[measure] - before[measure]
 
 
@@ -142,9 +174,14 @@ def verdict(change: Estimate | None, above: str = "above", below: str = "below")
 def rank(rows: Mapping[object, Mapping[object, float]], higher_is_better: bool = True) -> list[list]:
     """Name the rows that share the first place, and those that share the second; empty if nothing is ranked.
 
-    The row with the best mean has the first place, and with it all rows whose difference from it, in pairs,
-    is not shown; the others share the second place in the same way. Which row is best is told by the same
-    values, so that every pair of rows is a question: together they have 5 %.
+    The row with the best mean has the first place, and with it all rows whose difference from it is not
+    shown; the others share the second place in the same way. A difference is shown where both
+
+    * it is larger than Tukey's studentized range, which 5 % of columns without a difference exceed anywhere,
+      allows with the noise of all rows together, and
+    * its own interval leaves out 0: in pairs, or of rows without three shared seeds by ``lies_below``. So
+      rows with more noise than others are not judged by the noise of these. It is of 95 % for two rows and
+      of 98 % for five or more, so that among twelve, some with five times the noise, errors stay at 7 %.
 
     Args:
         rows: name -> values by seed (or whatever pairs them); rows with fewer than ``LEAST`` are not ranked.
@@ -154,19 +191,56 @@ def rank(rows: Mapping[object, Mapping[object, float]], higher_is_better: bool =
     >>> rank(psnr), rank({"a": {0: 1.0}, "b": {0: 2.0}})
     ([['a', 'b'], ['c']], [])
     """
+    sign = 1 if higher_is_better else -1
     left = {name: values for name, values in rows.items() if len(values) >= LEAST}
     if len(left) < 2:
         return []
-    questions, sign, places = math.comb(len(left), 2), 1 if higher_is_better else -1, []
+    places, questions = [], min(len(left), 5) / 2
+    noise, quantile = _residual(list(left.values()))
     while left and len(places) < 2:
         best = max(left.values(), key=lambda values: sign * statistics.fmean(values.values()))
-        changes = {n: Estimate.of(best[k] - v[k] for k in v if k in best) for n, v in left.items()}
-        places.append([name for name, change in changes.items() if not (change and change.sign(questions))])
+        places.append([])
+        for name, values in left.items():
+            error = noise * math.sqrt((1 / len(best) + 1 / len(values)) / 2)
+            gap = abs(statistics.fmean(best.values()) - statistics.fmean(values.values()))
+            is_behind = gap > quantile * error + 1e-9 and _differ(best, values, questions)
+            places[-1] += [] if is_behind else [name]
         left = {name: values for name, values in left.items() if name not in places[-1]}
     return places
 
 
-def lies_below(first: Estimate, second: Estimate, questions: int = 1) -> bool:
+def _residual(rows: Sequence[Mapping[object, float]]) -> tuple[float, float]:
+    """Return the standard deviation of what rows, and seeds where all have the same, do not explain, and the
+    95 % quantile of the studentized range for it.
+    """
+    means = [statistics.fmean(row.values()) for row in rows]
+    left = [{seed: value - mean for seed, value in row.items()} for row, mean in zip(rows, means)]
+    freedom = sum(len(row) - 1 for row in rows)
+    if all(row.keys() == rows[0].keys() for row in rows):  # complete blocks
+        of_seed = {seed: statistics.fmean(row[seed] for row in left) for seed in rows[0]}
+        left = [{seed: value - of_seed[seed] for seed, value in row.items()} for row in left]
+        freedom = (len(rows) - 1) * (len(of_seed) - 1)
+    squares = sum(value**2 for row in left for value in row.values())
+    return math.sqrt(squares / freedom), _studentized_range(len(rows), freedom)
+
+
+@cache
+def _studentized_range(rows: int, freedom: int) -> float:
+    from scipy.stats import studentized_range  # late, as its import takes time
+
+    return float(studentized_range.ppf(LEVEL, rows, freedom))
+
+
+def _differ(first: Mapping[object, float], second: Mapping[object, float], questions: float) -> bool:
+    """Tell whether the interval of the difference of two rows' means leaves out 0; ``questions`` as above."""
+    change = Estimate.of(first[seed] - second[seed] for seed in first if seed in second)
+    if change is not None and change.count >= LEAST:
+        return change.sign(questions) != 0
+    one, other = (Estimate.of(row.values()) for row in (first, second))
+    return lies_below(one, other, questions) or lies_below(other, one, questions)
+
+
+def lies_below(first: Estimate, second: Estimate, questions: float = 1) -> bool:
     """Tell whether one mean lies below another of other independent values, whose spreads may differ (Welch's
     t-test); no where either has fewer than ``LEAST`` values. ``questions`` as of ``half_width_among``.
 

@@ -16,8 +16,7 @@ from markupsafe import Markup
 from tabulate import tabulate
 
 from forewarp.metrics.registry import metric_of
-from forewarp.report.results import NETS
-from forewarp.report.statistics import INTERVALS, Estimate
+from forewarp.report.statistics import INTERVALS, NETS, Estimate, Factor
 
 TEMPLATES = Path(__file__).with_name("templates")
 MARKS = {
@@ -62,6 +61,8 @@ class Column:
 
         >>> [Column("PSNR", signed=True).text(Estimate.of(v)) for v in ([0.4, 0.5, 0.6], [0.4, 0.6], [0.4])]
         ['+0.50 ± 0.25', '+0.50 (+0.40, +0.60)', '+0.40']
+        >>> Column("time", prefix="×").text(Factor.of([1.0, 2.0, 2.0]))
+        '×1.59 (×0.59 to ×4.29)'
         >>> [Column("minutes", None).text(minutes) for minutes in (0.05, 1.0, 20.0)]
         ['0.05', '1', '20']
         """
@@ -74,6 +75,9 @@ class Column:
         return f"{self.prefix}{value:{sign}{form}}"
 
     def _spread(self, value: Estimate) -> str:
+        if isinstance(value, Factor):
+            low, high = (self.text(end) for end in value.ends)
+            return f" ({low}{', ' if value.count == 2 else ' to '}{high})" if value.count > 1 else ""
         bar = value.error_bar
         if value.count == 2:
             return f" ({self.text(value.mean - bar)}, {self.text(value.mean + bar)})"
