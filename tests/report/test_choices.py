@@ -130,7 +130,8 @@ def test_changes_are_against_the_same_seed(tmp_path):
     assert change[1:5] == ["base", "3", "-0.75 ± 0.62", "+0.0000 ± 0.0000"]
     # PSNR, SSIM and EPE; the other changes are of one seed.
     assert "3 differences are of three seeds or more; by chance 0.15 of their intervals" in text
-    assert change[5:] == ["-0.1000 ± 0.0000", "×0.50 ± 0.00", *["×1.00 ± 0.00"] * 3, "×2.00 ± 0.00"]
+    half, same, twice = (f"×{x} (×{x} to ×{x})" for x in ("0.50", "1.00", "2.00"))
+    assert change[5:] == ["-0.1000 ± 0.0000", half, same, same, same, twice]
     assert rows_of(text, "unet_16")[0][1:6] == ["grid_64", "1", "+1.50", "+0.0000", ""]
     assert rows_of(text, "rays=64")[1][1:4] == ["base", "1", "+1.00"]
     assert rows_of(text, "backward-fast rays=64")[0][1:4] == ["rays=64", "1", "+0.50"]
