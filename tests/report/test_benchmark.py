@@ -16,6 +16,7 @@ from forewarp.metrics.registry import METRICS, Metric
 from forewarp.report import figures
 from forewarp.report.benchmark import Published, read_published, write_methods, write_minutes
 from forewarp.report.figures import GAP
+from forewarp.report.stored import read_stored
 from tests.support.runs_on_disk import rows_of, write_run, write_views
 
 EARLIER = Path(__file__).parent / "earlier"  # tables as written before there were as many columns
@@ -379,3 +380,56 @@ def test_a_metric_that_was_added_has_a_column_and_stays_in_the_table(tmp_path, m
     write_run(tmp_path / "later", scene="hook", config={"model": {"name": "forward"}})
     text = pages_of(write_minutes(tmp_path / "later", out))["forward.md"]
     assert [rows_of(section(text, "Each"), scene)[0][6] for scene in ("ball", "hook")] == ["0.250", ""]
+
+
+def test_writing_twice_changes_no_table(tmp_path):
+    typed = ("rigid=1", "")  # the first typed the default
+    for seed, word in enumerate(typed):
+        write_run(tmp_path / "runs", "x", seed, metrics=TOY, against=None, command=f"forewarp-train {word}")
+    first = [write_minutes(tmp_path / "runs", tmp_path / "out")[1].read_text() for _ in range(2)]
+    again = write_methods(tmp_path / "runs", tmp_path / "out")[1].read_text()
+    assert again == write_methods(tmp_path / "runs", tmp_path / "out")[1].read_text()
+    assert first[0] == first[1]
+    assert [row["overrides"] for row in csv.DictReader(first[1].splitlines())] == ["", ""]
+
+
+@pytest.mark.parametrize("word", ["experiment", "scene"])  # the second tells neither apart
+def test_experiments_reported_on_different_days_are_not_pooled(tmp_path, word):
+    for _ in range(2):
+        for name, psnr in (("a", 30.0), ("b", 34.0)):
+            runs = tmp_path / name
+            if not runs.is_dir():
+                config = {"variant": None, "objective": {"weight": psnr}}
+                command = f"forewarp-train {word}={name}"
+                write_run(runs, "x", psnr=psnr, metrics=TOY, command=command, config=config)
+            page, table, _ = write_minutes(runs, tmp_path / "out")
+    rows = list(csv.DictReader(table.read_text().splitlines()))
+    assert sorted(row["psnr"] for row in rows) == ["30.0", "34.0"]
+    names = {row["overrides"] for row in rows}
+    digests = {f"configuration={row['digest']}" for row in rows}
+    assert names == ({"experiment=a", "experiment=b"} if word == "experiment" else digests)
+    assert len(digests) == 2
+    assert "32.00" not in page.read_text()
+
+
+def test_a_row_without_a_digest_is_replaced_by_its_run(tmp_path):
+    runs, out = tmp_path / "runs", tmp_path / "out"
+    write_run(runs, metrics=TOY)
+    _, table, _ = write_minutes(runs, out)
+    text = table.read_text()
+    rows = list(csv.DictReader(text.splitlines()))
+    table.write_text(text.replace(rows[0]["digest"], "").replace("30.0", "29.0"))
+    write_minutes(runs, out)
+    assert table.read_text() == text
+
+
+def test_a_column_of_another_version_is_refused_by_name(tmp_path):
+    _, table, _ = write_minutes(write_run(tmp_path / "runs", metrics=TOY).parent, tmp_path / "out")
+    lines = table.read_text().splitlines()
+    table.write_text("\n".join([f"{lines[0]},kind", f"{lines[1]},time"]))
+    told = r"forward.csv:2: expected a number in the column kind, but got 'time'; where an earlier version"
+    with pytest.raises(ValueError, match=told):
+        write_minutes(tmp_path / "runs", tmp_path / "out")
+    table.write_text("scene,variant,minutes,seed,views\nball,base,1,0,time\n")
+    with pytest.raises(ValueError, match=r"forward.csv:2: .* in the column views, but got 'time'"):
+        read_stored(table)

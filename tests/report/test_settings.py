@@ -2,6 +2,7 @@
 
 import os
 import re
+import shlex
 
 import pytest
 import yaml
@@ -10,7 +11,7 @@ from forewarp.report.benchmark import write_methods, write_minutes
 from forewarp.report.choices import write_accuracy_time, write_effects, write_price_list
 from forewarp.report.paper import write_ablation, write_paper
 from forewarp.report.results import read_runs
-from forewarp.report.settings import NOT_COUNTED, configuration
+from forewarp.report.settings import NOT_COUNTED, configuration, typed
 from tests.support.configs import ROOT
 from tests.support.runs_on_disk import rows_of, write_run
 
@@ -154,9 +155,31 @@ def test_what_does_not_count(tmp_path):
     assert configuration(config, {"texts": {}}) != configuration(config, {"texts": {"a": "b"}}) != own
 
 
+def planned(root, seed=0, motion="spline", **more):
+    """A run that planned its motion, and nothing else."""
+    model = {"name": "particles", "motion": {"name": motion}, **more}
+    command = f"forewarp-train seed={seed} effects=auto experiment={root.name}"
+    config = {"effects": "auto", "model": model, "variant": None}
+    folder = write_run(root, "auto", seed, command=command, config=config)
+    (folder / "plan.yaml").write_text(f"overrides: [model=particles, model/motion={motion}]\n")
+
+
 def test_a_plan_may_choose_otherwise_from_seed_to_seed(tmp_path):
-    for seed, motion in enumerate(("spline", None)):
-        config = {"effects": "auto", "model": {"name": "particles", "motion": motion}}
-        write_run(tmp_path, "auto", seed, config=config)
+    for seed, motion in enumerate(("spline", "none")):
+        planned(tmp_path, seed, motion)
     runs, _ = read_runs(tmp_path)
     assert [row["setting"] for row in runs] == ["", ""]
+
+
+def test_what_a_plan_leaves_alone_tells_planned_runs_apart(tmp_path):
+    for width, name in ((64.0, "a"), (32.0, "b")):  # of two experiments
+        for seed in range(2):
+            planned(tmp_path / name, seed, ("spline", "none")[seed], renderer={"width": width})
+    runs, _ = read_runs(tmp_path)
+    assert {row["folder"].parts[-3]: row["variant"] for row in runs} == {"a": "width=64", "b": "width=32"}
+    assert len(runs) == 4
+
+
+@pytest.mark.parametrize("word", ["", " ", "~stage.coarse"])
+def test_an_empty_word_of_a_command_sets_nothing(word):
+    assert [*typed(shlex.join(["forewarp-train", word, "seed=0"])).values()] == [word] * (word[:1] == "~")

@@ -27,6 +27,7 @@ from forewarp.report.settings import (
     CONDITIONS,
     SAME,
     configuration,
+    digest_of,
     grouped,
     key_of,
     name_settings,
@@ -37,7 +38,7 @@ from forewarp.report.statistics import NETS, Estimate
 
 Row = dict
 
-KEY = ("method", "preset", "scene", "minutes", "seed", *CONDITIONS, "overrides")
+KEY = ("method", "preset", "scene", "minutes", "seed", *CONDITIONS, "overrides", "digest")
 EARLIER = ("density", "steps_per_picture")  # columns of earlier tables, which ``overrides`` tells
 SCORES = ("psnr", "ssim", "lpips")  # that a table has, whether measured or not
 NUMBERS = ("steps", "step", "frame", "parameters", "memory", "ends", "motion_error")
@@ -274,8 +275,8 @@ def read_run(folder: Path) -> Row:
 
     * ``images``: ``name``, ``time``, ``ability``, ``psnr`` and ``scores`` of measured test views;
     * ``ablation``: name of the run's choice, None without one; ``about`` it; ``against``: the variant to
-      compare with; ``configuration`` as of ``settings``, which names among several runs each one's
-      ``overrides``, ``setting`` and ``variant``;
+      compare with; ``configuration`` as of ``settings``, with its ``digest``, which names among several runs
+      each one's ``overrides``, ``setting`` and ``variant``;
     * ``ability``: the kind of test view that scores are of: ``all``, else ``time`` (between training times),
       else the first; ``test``: the scores of every kind; ``tested``: number of views scored, None: all;
     * ``train`` (seconds), ``epe`` (world units), ``torch``, ``effects``, ``protocol``;
@@ -310,7 +311,9 @@ def read_run(folder: Path) -> Row:
     row = {"folder": folder, "config": config, "stages": stages, "metrics": metrics, "images": images}
     row |= {"points": points, "plan": yaml.safe_load(plan), "test": test, "measured_at": measured_at}
     row |= {"method": method, "preset": preset, "command": command, "ablation": ablation}
-    row["configuration"] = configuration(config, read_json(folder / "data.json"))
+    planned = (row["plan"] or {}).get("overrides") or ()
+    row["configuration"] = configuration(config, read_json(folder / "data.json"), planned)
+    row["digest"] = digest_of(row["configuration"])
     row |= {"about": variant.get("about", ""), "against": variant.get("against")}
     row |= {"scene": str(config["data"]["scene"]), "seed": int(config["seed"])}
     row |= {"minutes": budget["minutes"], "iterations": budget.get("iterations")}
@@ -349,12 +352,21 @@ def read_run(folder: Path) -> Row:
     # The metrics that tables of many runs show; of LPIPS that of one net.
     row["ability"] = [*(kind for kind in ("all", "time") if kind in test), *test, "all"][0]
     scores = test.get(row["ability"], {})
-    nets = [scores[f"lpips_{net}"] for net in NETS if scores.get(f"lpips_{net}") is not None]
     shown = {n: score for n, score in scores.items() if metric_of(n).summary and not n.startswith("lpips_")}
-    scores = dict.fromkeys(SCORES) | shown | {"lpips": nets[0] if nets else None}
+    scores = dict.fromkeys(SCORES) | shown | {"lpips": score_of(scores, "lpips")}
     row |= scores | {"scores": scores}
     name_settings([row])
     return row
+
+
+def score_of(scores: dict, name: str) -> float | None:
+    """Return a score of a kind of test view; ``lpips`` is of the first net whose weights were there.
+
+    >>> score_of({"psnr": 30.0, "lpips_alex": 0.25}, "lpips"), score_of({"psnr": 30.0}, "lpips")
+    (0.25, None)
+    """
+    names = [f"lpips_{net}" for net in NETS] if name == "lpips" else [name]
+    return next((scores[name] for name in names if scores.get(name) is not None), None)
 
 
 def read_compared(folders: Sequence[str | Path]) -> dict[str, Runs]:
@@ -432,14 +444,19 @@ def ends_below(views: Sequence[tuple[float, float]]) -> float | None:
 def add_rows(file: Path, rows: Iterable[Row]) -> Runs:
     """Add rows to those of a CSV file, which is written; return all.
 
-    Of rows with the same ``KEY`` the one measured last stays; a run beats a row of its day. Each gets its
-    ``setting`` among all of them.
+    Of rows with the same ``KEY`` the one measured last stays; a run beats a row of its day, and one of an
+    earlier version, which has no ``digest``. Each gets its ``setting`` among all of them.
+
+    Raises:
+        ValueError: if a column that holds numbers has something else.
     """
-    known = [_read(row) for row in read_rows(file)]
-    known += sorted(rows, key=lambda row: row["measured_at"])
-    name_settings(known)
-    last = {key_of(row, KEY): row for row in sorted(known, key=lambda row: row["day"] or "")}
-    runs = Runs(last[key] for key in sorted(last, key=_order))
+    every = [_read(row, f"{file}:{line}") for line, row in enumerate(read_rows(file), 2)]
+    every += sorted(rows, key=lambda row: row["measured_at"])
+    name_settings(every)
+    last = {key_of(row, KEY): row for row in sorted(every, key=lambda row: row["day"] or "")}
+    with_digest = {key[:-1] for key in last if key[-1] is not None}
+    kept = [key for key in last if key[-1] is not None or key[:-1] not in with_digest]
+    runs = Runs(last[key] for key in sorted(kept, key=_order))
     text, fields = io.StringIO(), (*KEY, *runs.scores(), *NUMBERS, *TEXTS)
     writer = csv.DictWriter(text, fields, extrasaction="ignore", lineterminator="\n")
     writer.writeheader()
@@ -448,17 +465,34 @@ def add_rows(file: Path, rows: Iterable[Row]) -> Runs:
     return runs
 
 
-def _read(row: dict[str, str]) -> Row:
-    """Turn a row of a CSV file into one of ``read_run``; an older table lacks some columns."""
-    known = (*KEY, *SCORES, *NUMBERS, *TEXTS, *EARLIER)
-    scores = [*SCORES, *(name for name in row if name not in known)]
+def _read(row: dict[str, str], place: str) -> Row:
+    """Turn a row of a CSV file, in the line ``place``, into one of ``read_run``; an older table lacks some
+    columns.
+    """
+    columns = (*KEY, *SCORES, *NUMBERS, *TEXTS, *EARLIER)
+    scores = [*SCORES, *(name for name in row if name not in columns)]
     numbers = ("minutes", "threads", "iterations", "held_out", "train_views", *scores, *NUMBERS)
     typed = {name: row.get(name) or None for name in (*KEY, *TEXTS)}
-    typed |= {name: _number(row.get(name)) for name in numbers}
+    typed |= {"overrides": row.get("overrides")}  # without any is not unknown
+    typed |= {name: number_in(row, name, place) for name in numbers}
     if " scene=counterpart_" in (typed["command"] or "") and not typed["dataset"].startswith("counterpart"):
         typed["dataset"] = COUNTERPART + typed["dataset"]
-    typed |= {"ablation": None, "seed": int(row["seed"]), "clock": typed["clock"] or "wall"}
+    typed |= {"ablation": None, "seed": int(number_in(row, "seed", place)), "clock": typed["clock"] or "wall"}
     return typed | {"scores": {name: typed[name] for name in scores}}
+
+
+def number_in(row: dict[str, str], name: str, place: str) -> float | None:
+    """Read a cell of a CSV file; None where it is empty or there is no such column.
+
+    >>> number_in({"psnr": "30.5"}, "psnr", "a.csv:2"), number_in({}, "psnr", "a.csv:2")
+    (30.5, None)
+    """
+    try:
+        return _number(row.get(name))
+    except ValueError:
+        expected = f"expected a number in the column {name}, but got {row[name]!r:.80}"
+        advice = "where an earlier version wrote the file, move it away and write the page of its runs"
+        raise ValueError(f"{place}: {expected}; {advice}") from None
 
 
 def _number(text: str | None) -> float | None:

@@ -38,10 +38,21 @@ NOT_COUNTED = {
 }
 WATCHERS = "forewarp."  # callbacks below it only watch
 # Typed keys whose choice every row has in a column or in its ``CONDITIONS``.
-TOLD = {"model", "preset", "ablation", "experiment", "dataset", "scene", "data", "data.scene", "windows"}
-TOLD |= {"data.held_out", "data.half_resolution", "data.scale", "trainer"}
-TOLD |= {"sweeps", "launcher", "budget.minutes", "budget.iterations", "budget.clock", "budget"}
+IN_COLUMNS = {
+    "model",
+    "preset",
+    "ablation",
+    "experiment",
+    "dataset",
+    "scene",
+    "data",
+    "data.scene",
+    "windows",
+}
+IN_COLUMNS |= {"data.held_out", "data.half_resolution", "data.scale", "trainer"}
+IN_COLUMNS |= {"sweeps", "launcher", "budget.minutes", "budget.iterations", "budget.clock", "budget"}
 
+DIGEST = "configuration"  # names rows of tables whose configurations nothing else tells apart
 # Rows that differ in these are not compared; how each is named where rows differ in it.
 CONDITIONS = {"clock": "{} clock", "threads": "threads: {:g}", "device": "{}", "measured": "{}"}
 CONDITIONS |= {"pictures": "{}", "iterations": "{:g} steps at most", "held_out": "{:g} views held out"}
@@ -75,15 +86,16 @@ def counts(key: str) -> bool:
     return not any(".".join(parts[:n]) in NOT_COUNTED for n in range(1, len(parts) + 1))
 
 
-def configuration(config: Mapping, files: object = None) -> dict[str, object]:
+def configuration(config: Mapping, files: object = None, planned: Iterable[str] = ()) -> dict[str, object]:
     """Return what counts of a run's configuration: dotted key -> value; a key that is null has no entry.
 
     Of a run that planned its effects (``effects: auto``) what the plan chose does not count, which may differ
-    from seed to seed, but what was typed does.
+    from seed to seed, but what was typed does, and what the plan left alone.
 
     Args:
         config: the content of ``config.yaml``.
         files: the fingerprint of the scene's files, if there is one.
+        planned: the overrides of the run's plan.
     """
     found = {key: value for key, value in flat(config) if counts(key) and value is not None}
     for name, callback in (config.get("callbacks") or {}).items():
@@ -100,12 +112,22 @@ def configuration(config: Mapping, files: object = None) -> dict[str, object]:
         if (stage or {}).get("objective") == (config.get("objective") or {}).get(name):
             found = {key: v for key, v in found.items() if not key.startswith(f"stage.{name}.objective.")}
     if config.get("effects") == "auto":
-        decided = re.compile(r"model\.(?!name$|_target_$)|stage\.\w+\.effects$|preset\.")
-        found = {key: value for key, value in found.items() if not decided.match(key)}
+        effects = [word.partition("=")[0].replace("/", ".") for word in planned if word.startswith("model/")]
+        effects += ["model.trajectory"] if "model.motion" in effects else []  # which motion brings
+        found = {key: v for key, v in found.items() if ".".join(key.split(".")[:2]) not in effects}
         found |= typed(str(config.get("command")))
     if files:
-        found["data.files"] = hashlib.sha256(json.dumps(files, sort_keys=True).encode()).hexdigest()[:8]
+        found["data.files"] = digest_of(files)
     return found
+
+
+def digest_of(content: object) -> str:
+    """Return eight digits of a SHA-256 of what JSON can hold.
+
+    >>> digest_of({"a": 1.0, "b": None}) == digest_of({"b": None, "a": 1.0})
+    True
+    """
+    return hashlib.sha256(json.dumps(content, sort_keys=True, default=str).encode()).hexdigest()[:8]
 
 
 def _is_drawn_anew(config: Mapping) -> bool:
@@ -141,10 +163,11 @@ def typed(command: str) -> dict[str, str]:
     """
     words = []
     with suppress(ValueError):  # quotes that do not end
-        words = [word for word in shlex.split(command.partition(" #")[0]) if "=" in word or word[0] == "~"]
-    known = {re.split(r"=", word)[0].lstrip("+~"): re.sub(r"\s", "", word) for word in words}
-    own = {key: word for key, word in known.items() if key not in TOLD and counts(key)}
-    return {key: word for key, word in own.items() if not key.startswith(("-", "hydra."))}
+        words = shlex.split(command.partition(" #")[0])
+    overrides = [re.sub(r"\s", "", word) for word in words if "=" in word or word.startswith("~")]
+    by_key = {word.partition("=")[0].lstrip("+~"): word for word in overrides}
+    counted = {key: word for key, word in by_key.items() if key not in IN_COLUMNS and counts(key)}
+    return {key: word for key, word in counted.items() if not key.startswith(("-", "hydra."))}
 
 
 def name_settings(rows: Sequence[Row]) -> None:
@@ -157,6 +180,7 @@ def name_settings(rows: Sequence[Row]) -> None:
     in them, and its words; ``base`` for a row without any of those that others of its method and preset have.
 
     A row of a CSV file has no ``configuration``: the ``overrides`` stored there tell, or else its command.
+    Rows of the same words with another ``digest`` are named by their experiments, or else by the digest.
     """
     words: dict[int, dict[str, str]] = {}
     for family in grouped((family_of(row), row) for row in rows).values():
@@ -201,14 +225,32 @@ def _overrides(family: Sequence[Row]) -> dict[int, dict[str, str]]:
         known = [_stored(row) for row in same]
         shared = [key for key in sorted(known[0]) if all(key in of_row for of_row in known)]
         words |= {id(row): {key: known[0][key] for key in shared} for row in same}
-    configured, used = [row for row in family if row.get("configuration")], set()
+    configured, used = [row for row in family if row.get("configuration") is not None], set()
     while key := _telling(configured, words, used):
         used.add(key)
         for row in configured:
             words[id(row)] = dict(
                 sorted((words[id(row)] | _word(key, row["configuration"].get(key))).items())
             )
+    cells = grouped((_cell(row, words), row) for row in family if row.get("digest"))
+    for cell in cells.values():
+        pairs, digests = {(row["digest"], _experiment(row)) for row in cell}, {row["digest"] for row in cell}
+        is_distinct = len({experiment for _, experiment in pairs}) == len(pairs) == len(digests)
+        for row in cell if len(digests) > 1 else ():
+            word = _experiment(row) if is_distinct else f"{DIGEST}={row['digest']}"
+            words[id(row)] |= {word.partition("=")[0]: word}
     return words
+
+
+def _cell(row: Row, words: Mapping[int, Mapping]) -> tuple:
+    """Return what rows of one family share that only their configurations could tell apart."""
+    return key_of(row, ("scene", "minutes", *CONDITIONS)), _text(words[id(row)])
+
+
+def _experiment(row: Row) -> str:
+    """Return the typed override that chooses a row's experiment; ``experiment=none`` without one."""
+    typed_words = re.findall(r"(?:^|\s)\+?(experiment=\S+)", row["command"] or "")
+    return typed_words[-1] if typed_words else "experiment=none"
 
 
 def _word(key: str, value: object) -> dict[str, str]:
@@ -232,24 +274,23 @@ def value_text(key: str, own: Mapping[str, object]) -> str:
 
 
 def _identity(row: Row) -> object:
-    """Tell which configuration a row has; of a row of a CSV file, what its command tells."""
-    own = row.get("configuration")
-    return frozenset(own.items()) if own else tuple(_stored(row).values())
+    """Tell which configuration a row has; of a row of a table without digests, what its overrides tell."""
+    return row.get("digest") or tuple(_stored(row).values())
 
 
 def _stored(row: Row) -> dict[str, str]:
-    """Return the overrides of a row by their keys."""
+    """Return the overrides of a row by their keys, but for those that ``_overrides`` adds to tables."""
     if (stored := row.get("overrides")) is None:
         return typed(row["command"] or "")
-    return {re.split("=", word)[0].lstrip("+~"): word for word in words_of(stored)}
+    named = {re.split("=", word)[0].lstrip("+~"): word for word in words_of(stored)}
+    return {key: word for key, word in named.items() if key not in ("experiment", DIGEST)}
 
 
 def _telling(rows: Sequence[Row], words: Mapping[int, Mapping], used: set[str]) -> str | None:
     """Choose the key, none of ``used``, that tells the most configurations apart which share their words and
     conditions; None where all are told apart.
     """
-    names = "scene", "minutes", *CONDITIONS
-    cells = grouped(((key_of(row, names), _text(words[id(row)])), row["configuration"]) for row in rows)
+    cells = grouped((_cell(row, words), row["configuration"]) for row in rows)
     told: dict[str, int] = {}
     for cell in cells.values():
         found = list({frozenset(own.items()): own for own in cell}.values())

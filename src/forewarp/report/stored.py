@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from forewarp.files import read_rows
-from forewarp.report.results import SCORES, Point, Row, Runs, pairs, read_runs
+from forewarp.report.results import SCORES, Point, Row, Runs, number_in, pairs, read_runs
 from forewarp.report.settings import name_settings
 
 TEXTS = ("scene", "variant", "ablation", "against", "about", "method", "preset", "ability", "effects")
@@ -65,7 +65,7 @@ def read_stored(file: Path) -> Runs:
 
 def _row(line: dict[str, str], place: Path, number: int) -> Row:
     row = {name: line.get(name) or None for name in TEXTS}
-    row |= {name: float(line[name]) if line.get(name) else None for name in NUMBERS}
+    row |= {name: number_in(line, name, str(place)) for name in NUMBERS}
     row |= {name: int(row[name]) for name in WHOLE if row[name] is not None}
     row |= {name: row[name] or "" for name in ("effects", "about", "image_format")}
     row |= {"counterpart": bool(row["counterpart"])}
@@ -74,7 +74,8 @@ def _row(line: dict[str, str], place: Path, number: int) -> Row:
     row |= {"points": tuple(Point(seconds, psnr, 0) for seconds, psnr in pairs(row["curve"]))}
     row |= {"plan": json.loads(line.get("plan") or "{}"), "test": {}}
     others = {*TEXTS, *NUMBERS, "overrides", "plan"}
-    scores = dict.fromkeys(SCORES) | {n: float(v) if v else None for n, v in line.items() if n not in others}
+    scored = [name for name in line if name not in others]
+    scores = dict.fromkeys(SCORES) | {name: number_in(line, name, str(place)) for name in scored}
     for column in [name for name in scores if name.startswith(OF_KIND)]:
         kind, name = column.removeprefix(OF_KIND).split(" ", 1)
         if (score := scores.pop(column)) is not None:
