@@ -1,6 +1,7 @@
 """``kind=table`` and ``kind=compare``: every number of a four-job multirun, worked by hand."""
 
 import csv
+import json
 import os
 
 import pytest
@@ -117,6 +118,31 @@ def test_ones_own_metrics_and_datasets_are_taken(tmp_path, monkeypatch):
     assert [cell.split(" ")[0] for cell in row[1:]] == ["mine", "0.2", "2.0000", "26.00", "8.00", "50.0"]
 
 
+def test_a_metric_of_any_kind_and_net_is_found(tmp_path):
+    scores = {"psnr": 25.0, "ms_ssim": 0.75, "lpips_vgg": 0.25, "lpips_alex": 0.5, "depth_rmse": 0.125}
+    metrics = {"test": {"time": scores, "all": scores | {"lpips_vgg": 0.375}}}
+    write_run(tmp_path / "runs", metrics=metrics)
+    names = ["ms_ssim", "lpips_vgg", "lpips", "all/lpips", "time/lpips", "lpips_alex"]
+    (row,) = rows_of(table(tmp_path / "runs", tmp_path, rows="model", metrics=names), "forward")
+    assert [float(cell) for cell in row[1:]] == [0.75, 0.375, 0.375, 0.375, 0.25, 0.5]
+
+
+def test_the_picture_is_of_the_first_metric_that_a_run_has(tmp_path, monkeypatch):
+    from forewarp.report import table as module
+
+    drawn = []
+    monkeypatch.setattr(module, "save", lambda figure, path: drawn.append(figure) or path)
+    write_run(tmp_path / "runs")
+    _, written = write_table([tmp_path / "runs"], tmp_path, metrics=["lpips", "ssim"], pareto=True)
+    assert (written[-1].name, drawn[0].axes[0].get_ylabel()) == ("table-pareto.png", "SSIM")
+    for numbers in (tmp_path / "runs").rglob("metrics.json"):  # without any cost
+        costs = {"seconds": {"train": None}, "peak_memory_bytes": None, "parameters": 0}
+        numbers.write_text(json.dumps(json.loads(numbers.read_text()) | costs))
+    (tmp_path / "runs" / "ball" / "base-1.0-seed0" / "coarse" / "done.json").unlink()
+    write_table([tmp_path / "runs"], tmp_path, pareto=True)
+    assert len(drawn[1].axes[0].lines) == 0
+
+
 def test_the_front_is_drawn_of_three_costs(tmp_path, monkeypatch):
     from forewarp.report import table as module
 
@@ -161,6 +187,16 @@ def test_commas_and_lists_are_typed_as_they_are(ok, in_tmp):
             f"written: {os.path.join('runs', 'mine', 'results', name)}"
             for name in ("table.md", "table.csv", "table.tex")
         ]
+
+
+def test_of_a_pattern_what_holds_no_run_is_left_out(ok, in_tmp):
+    for seed in range(2):
+        write_run("runs", "x", seed)
+    (in_tmp / "runs" / "notes").mkdir()
+    ok("report", "kind=table", "runs=runs/ball")  # writes runs/ball/results
+    assert (in_tmp / "runs" / "ball" / "results" / "table.md").is_file()
+    assert "seeds 0, 1" in ok("report", "kind=compare", "runs=[runs/ball/*]").out
+    assert "30.00 (30.00, 30.00)" in ok("report", "kind=table", "runs=runs/*").out
 
 
 def test_a_report_of_nothing_says_what_it_looked_for(refused, in_tmp):

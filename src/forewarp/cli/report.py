@@ -102,7 +102,7 @@ def tabled(config: DictConfig) -> str:
 
     one_of(config.pareto, "pareto", True, False)
     named = listed(config.runs) or [config.paths.runs]
-    folders = [Path(folder) for name in named for folder in sorted(glob(name)) or [name]]
+    folders = [Path(folder) for name in named for folder in expanded(name, "**/config.yaml")]
     names = {key: listed(config[name]) for key, name in (("rows", "rows"), ("columns", "columns"))}
     names["metrics"] = listed(config.metric) or ["psnr"]
     out = Path(config.out or (folders[0] if len(folders) == 1 else Path(config.paths.runs)) / "results")
@@ -116,6 +116,12 @@ def listed(names: object) -> list[str]:
     return [str(name).strip() for name in given]
 
 
+def expanded(name: str, needed: str) -> list[str]:
+    """List the folders that a pattern means and that hold ``needed``; without any, all, which are refused."""
+    folders = sorted(glob(name))
+    return [folder for folder in folders if any(Path(folder).glob(needed))] or folders or [name]
+
+
 def compared(config: DictConfig) -> str:
     """Return the table of ``kind=compare``; draw a view by each run where ``out`` is set."""
     from forewarp.report.choices import compare
@@ -123,7 +129,7 @@ def compared(config: DictConfig) -> str:
     from forewarp.report.results import read_compared
 
     named = [config.runs] if isinstance(config.runs, str) else list(config.runs or ())
-    groups = read_compared([folder for name in named for folder in sorted(glob(str(name))) or [str(name)]])
+    groups = read_compared([folder for name in named for folder in expanded(str(name), "config.yaml")])
     compared_runs = compare(groups)
     table = "\n".join(filter(None, [compared_runs.plain(), compared_runs.caption]))
     if not config.out:

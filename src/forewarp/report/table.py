@@ -12,7 +12,7 @@ from pathlib import Path
 from forewarp.files import replace_file
 from forewarp.metrics.registry import METRICS, metric_of
 from forewarp.report.figures import figure_of, pareto_front, save
-from forewarp.report.results import Row, Runs, length, nothing, read_folders
+from forewarp.report.results import Row, Runs, length, nothing, read_folders, score_of
 from forewarp.report.settings import CONDITIONS, grouped, key_of, value_text
 from forewarp.report.statistics import INTERVALS, Estimate, rank
 from forewarp.report.tables import Column, Table, rendered
@@ -45,7 +45,7 @@ def write_table(
         out: folder to write to.
         rows, columns: names of ``FIELDS``, or keys of ``config.yaml``, whole or their last parts.
         metrics: names in ``metrics.json``, of the usual test views or as ``space/psnr``; or of ``COSTS``.
-        pareto: draw the first metric against seconds, memory and bytes.
+        pareto: draw the first metric that a run has against seconds, memory and bytes.
 
     Returns:
         the table as Markdown, and the files written.
@@ -61,7 +61,7 @@ def write_table(
         )
     for row in runs:
         row["bytes"] = row["parameters"] and 4 * row["parameters"]  # of 32 bits
-    cells = cells_of(runs, rows, columns)
+    cells = runs_by_cell(runs, rows, columns)
     table = table_of(cells, rows, columns, metrics)
     text = f"{table}\n" + "".join(f"\nLeft out: {line}\n" for line in left_out)
     files = {"table.md": text, "table.csv": table.csv()}
@@ -70,7 +70,8 @@ def write_table(
         replace_file(out / name, content)
     written = [out / name for name in files]
     if pareto:
-        written.append(draw_pareto(out / "table-pareto.png", cells, metrics[0], rows, columns))
+        present = next(name for name in metrics if any(value_of(run, name) is not None for run in runs))
+        written.append(draw_pareto(out / "table-pareto.png", cells, present, rows, columns))
     return text, written
 
 
@@ -110,7 +111,7 @@ def _keys(row: Row) -> set[str]:
     return {key.removesuffix("._target_") for key in row["configuration"]}
 
 
-def cells_of(runs: Runs, rows: Sequence[str], columns: Sequence[str]) -> dict[tuple[tuple, tuple], Runs]:
+def runs_by_cell(runs: Runs, rows: Sequence[str], columns: Sequence[str]) -> dict[tuple[tuple, tuple], Runs]:
     """Group runs by the values of rows and of columns, in the order of these.
 
     Raises:
@@ -164,9 +165,7 @@ def value_of(row: Row, metric: str) -> float | None:
     if metric in COSTS:
         return row[metric]
     kind, slash, name = metric.rpartition("/")
-    if slash:
-        return row["test"].get(kind, {}).get(name)
-    return row[metric] if metric == "lpips" else row["scores"].get(metric)
+    return score_of(row["test"].get(kind if slash else row["ability"], {}), name)
 
 
 def table_of(
@@ -178,7 +177,7 @@ def table_of(
     """Make the table; in each column the best, with all whose difference from it is not shown, is marked.
 
     Args:
-        cells: as of ``cells_of``.
+        cells: as of ``runs_by_cell``.
         rows, columns, metrics: as of ``write_table``.
 
     Raises:
@@ -189,7 +188,8 @@ def table_of(
     every = Runs(run for own in cells.values() for run in own)
     absent = [name for name in metrics if all(value_of(run, name) is None for run in every)]
     if len(absent) == len(metrics) or not {*absent} <= {"lpips", *METRICS, *COSTS}:
-        scores = (name for run in every for name, value in run["scores"].items() if value is not None)
+        tested = (run["test"].get(run["ability"], {}) for run in every)
+        scores = (name for of_run in tested for name, value in of_run.items() if value is not None)
         known = dict.fromkeys([*scores, *COSTS])
         kinds = dict.fromkeys(kind for run in every for kind in run["test"])
         expected = f"{', '.join(known)}, or {'/, '.join(kinds)}/ before one"
@@ -283,7 +283,7 @@ def draw_pareto(
 
     Args:
         path: file of the picture.
-        cells: as of ``cells_of``; a row of panels for each of the columns.
+        cells: as of ``runs_by_cell``; a row of panels for each of the columns.
         metric, rows, columns: as of ``write_table``; the last two name what the values are of.
     """
     heads = list(dict.fromkeys(column for _, column in cells))
@@ -319,6 +319,6 @@ def draw_pareto(
     handles = {
         label: handle for axis in axes.flat for handle, label in zip(*axis.get_legend_handles_labels())
     }
-    handles["Pareto front"] = handles.pop("Pareto front")  # last
+    handles |= {label: handles.pop(label) for label in ("Pareto front",) if label in handles}  # last
     figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=4, fontsize="small")
     return save(figure, path)
