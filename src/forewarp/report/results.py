@@ -100,8 +100,8 @@ class Runs(list[Row]):
 
     def mean(self, name: str) -> float | None:
         """Average a number over the rows that have it; None if none has."""
-        found = self.estimate(name)
-        return found and found.mean
+        estimate = self.estimate(name)
+        return estimate and estimate.mean
 
     def summary(self, **more: object) -> Row:
         """Make one row of runs that differ in the seed: estimates of numbers, else what the first has.
@@ -236,8 +236,8 @@ def read_folders(roots: Sequence[Path]) -> tuple[Runs, list[str]]:
     """Read all runs below several folders as ``read_runs`` does, and name them among all."""
     runs, left_out = Runs(), []
     for root in roots:
-        found, others = read_runs(root)
-        runs += found
+        of_root, others = read_runs(root)
+        runs += of_root
         left_out += [f"{root}: {line}" if len(roots) > 1 else line for line in others]
     runs = Runs({row["folder"].resolve(): row for row in runs}.values())
     name_settings(runs)
@@ -291,11 +291,11 @@ def read_run(folder: Path) -> Row:
     plan = read_text(folder / "plan.yaml", MOST_CONFIG) if (folder / "plan.yaml").is_file() else "{}"
     points, images = read_points(folder), []
     for image in (read_json(folder / "per_image.json") or {}).get("images", []):
-        found = {name: float(value) for name, value in image["scores"].items() if value is not None}
-        found = {name: value for name, value in found.items() if math.isfinite(value)}
-        if "psnr" in found and math.isfinite(time := float(image["time"])):
+        scores = {name: float(value) for name, value in image["scores"].items() if value is not None}
+        scores = {name: value for name, value in scores.items() if math.isfinite(value)}
+        if "psnr" in scores and math.isfinite(time := float(image["time"])):
             of_image = {"name": str(image.get("name")), "time": time, "ability": str(image.get("ability"))}
-            images.append(of_image | {"psnr": found["psnr"], "scores": found})
+            images.append(of_image | {"psnr": scores["psnr"], "scores": scores})
     images.sort(key=lambda image: image["name"])
 
     protocol, test, flow, sizes = (metrics.get(key) or {} for key in ("protocol", "test", "flow", "size"))
@@ -318,8 +318,8 @@ def read_run(folder: Path) -> Row:
     row |= {"scene": str(config["data"]["scene"]), "seed": int(config["seed"])}
     row |= {"minutes": budget["minutes"], "iterations": budget.get("iterations")}
     row |= {"clock": protocol.get("clock") or budget.get("clock") or "wall"}
-    told = ("threads", "device", "commit", "departures", "faults", "train_views")
-    row |= {name: protocol.get(name) for name in told}
+    copied = ("threads", "device", "commit", "departures", "faults", "train_views")
+    row |= {name: protocol.get(name) for name in copied}
     row |= {"torch": protocol.get("versions", {}).get("torch"), "held_out": protocol.get("held_out") or None}
     row |= {"measured": protocol.get("measured", f"all {frames} test views" if frames else None)}
     row |= {"tested": int(tested) if tested.isdigit() else None}  # as of "10 of 30 test views, evenly spread"
@@ -330,12 +330,12 @@ def read_run(folder: Path) -> Row:
     row |= {"curve": " ".join(f"{point.seconds:.1f}:{point.psnr:.2f}" for point in points)}
     views = sorted((image["time"], image["psnr"]) for image in images)
     row |= {"views": " ".join(f"{time:.4f}:{psnr:.2f}" for time, psnr in views), "ends": ends_below(views)}
-    known = [key for key in PROTOCOL if protocol.get(key) or (key == "canonical_time" and key in protocol)]
-    told = [f"{key.replace('_', ' ')} {_text(protocol[key])}" for key in known]
+    keys = [key for key in PROTOCOL if protocol.get(key) or (key == "canonical_time" and key in protocol)]
+    parts = [f"{key.replace('_', ' ')} {_text(protocol[key])}" for key in keys]
     row["pictures"] = pictures_in_words(protocol)
-    known = [(name, protocol.get(name)) for name in ("half_resolution", "scale", "background")]
-    row["image_format"] = ", ".join(f"{name.replace('_', ' ')} {v}" for name, v in known if v is not None)
-    words = [dataset, row["pictures"] or "background unknown", *told, protocol.get("note")]
+    formats = [(name, protocol.get(name)) for name in ("half_resolution", "scale", "background")]
+    row["image_format"] = ", ".join(f"{name.replace('_', ' ')} {v}" for name, v in formats if v is not None)
+    words = [dataset, row["pictures"] or "background unknown", *parts, protocol.get("note")]
     row["protocol"] = ", ".join(filter(None, words))
 
     row |= {f"psnr_{kind}": test.get(kind, {}).get("psnr") for kind in ("space", "time", "canonical")}
@@ -390,12 +390,15 @@ def read_compared(folders: Sequence[str | Path]) -> dict[str, Runs]:
     name_settings(rows)
     again = {id(row) for row in repeated(rows)}  # what is named twice stands beside itself
     apart = grouped(((key_of(row, (*SAME, "setting")), id(row) in again), row) for row in rows)
-    groups = [Runs(sorted(own, key=lambda row: row["seed"])) for own in apart.values()]
-    methods = [own[0]["metrics"].get("protocol", {}).get("method", own[0]["folder"].name) for own in groups]
-    places = [own[0]["folder"].as_posix() for own in groups]
-    names = [own[0]["folder"].resolve().name for own in groups]
-    settings = [own[0]["variant"] for own in groups]
-    scenes = [f"{own[0]['scene']} {variant}" for own, variant in zip(groups, settings)]
+    groups = [Runs(sorted(of_group, key=lambda row: row["seed"])) for of_group in apart.values()]
+    methods = [
+        of_group[0]["metrics"].get("protocol", {}).get("method", of_group[0]["folder"].name)
+        for of_group in groups
+    ]
+    places = [of_group[0]["folder"].as_posix() for of_group in groups]
+    names = [of_group[0]["folder"].resolve().name for of_group in groups]
+    settings = [of_group[0]["variant"] for of_group in groups]
+    scenes = [f"{of_group[0]['scene']} {variant}" for of_group, variant in zip(groups, settings)]
     choices = [methods, settings, scenes] if len(groups) < len(rows) else [methods, names]
     choices += [places, [f"{number} {place}" for number, place in enumerate(places, 1)]]
     return dict(zip(next(names for names in choices if len(set(names)) == len(names)), groups))
@@ -405,8 +408,8 @@ def read_points(folder: Path) -> tuple[Point, ...]:
     """Read the rows of a run's ``accuracy_time.csv``; a missing file has none."""
     rows = read_rows(folder / "accuracy_time.csv")
     names = "seconds", "psnr", "step", "epe_moving"
-    told = ([row[name] for name in names] for row in rows)
-    return tuple(Point(float(at), float(psnr), int(step), _number(epe)) for at, psnr, step, epe in told)
+    cells = ([row[name] for name in names] for row in rows)
+    return tuple(Point(float(at), float(psnr), int(step), _number(epe)) for at, psnr, step, epe in cells)
 
 
 def pictures_in_words(protocol: dict) -> str | None:

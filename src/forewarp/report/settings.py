@@ -97,28 +97,28 @@ def configuration(config: Mapping, files: object = None, planned: Iterable[str] 
         files: the fingerprint of the scene's files, if there is one.
         planned: the overrides of the run's plan.
     """
-    found = {key: value for key, value in flat(config) if counts(key) and value is not None}
+    counted = {key: value for key, value in flat(config) if counts(key) and value is not None}
     for name, callback in (config.get("callbacks") or {}).items():
         if callback and not str(callback.get("_target_")).startswith(WATCHERS):
-            found |= {f"callbacks.{name}.{key}": value for key, value in flat(callback)}
-    if found.get("data.seed") == config.get("seed"):
-        found.pop("data.seed", None)
+            counted |= {f"callbacks.{name}.{key}": value for key, value in flat(callback)}
+    if counted.get("data.seed") == config.get("seed"):
+        counted.pop("data.seed", None)
     if _is_drawn_anew(config):
-        found.pop("data.synthesis.seed")
+        counted.pop("data.synthesis.seed")
         files = None
-    if start := found.get("start"):  # of the same seed, where windows of a film have several
-        found["start"] = re.sub(rf"seed{config.get('seed')}\b", "seed", str(start))
+    if start := counted.get("start"):  # of the same seed, where windows of a film have several
+        counted["start"] = re.sub(rf"seed{config.get('seed')}\b", "seed", str(start))
     for name, stage in (config.get("stage") or {}).items():  # repeats objective.<name>
         if (stage or {}).get("objective") == (config.get("objective") or {}).get(name):
-            found = {key: v for key, v in found.items() if not key.startswith(f"stage.{name}.objective.")}
+            counted = {key: v for key, v in counted.items() if not key.startswith(f"stage.{name}.objective.")}
     if config.get("effects") == "auto":
         effects = [word.partition("=")[0].replace("/", ".") for word in planned if word.startswith("model/")]
         effects += ["model.trajectory"] if "model.motion" in effects else []  # which motion brings
-        found = {key: v for key, v in found.items() if ".".join(key.split(".")[:2]) not in effects}
-        found |= typed(str(config.get("command")))
+        counted = {key: v for key, v in counted.items() if ".".join(key.split(".")[:2]) not in effects}
+        counted |= typed(str(config.get("command")))
     if files:
-        found["data.files"] = digest_of(files)
-    return found
+        counted["data.files"] = digest_of(files)
+    return counted
 
 
 def digest_of(content: object) -> str:
@@ -191,17 +191,19 @@ def name_settings(rows: Sequence[Row]) -> None:
     for of_scene in grouped((row["scene"], words[id(row)]) for row in rows).values():
         every = {key for of_row in of_scene for key in of_row}
         kept |= {key for key in every if len({of_row.get(key) for of_row in of_scene}) > 1}
-    words = {row: {key: word for key, word in own.items() if key in kept} for row, own in words.items()}
+    words = {
+        row: {key: word for key, word in overrides.items() if key in kept} for row, overrides in words.items()
+    }
     short = shortest({key for of_row in words.values() for key in of_row})
     plain = grouped((family_of(row), row) for row in rows if family_of(row)[-1] is None)
-    counted = {name: len({_text(words[id(row)]) for row in found}) for name, found in plain.items()}
+    counted = {name: len({_text(words[id(row)]) for row in of_family}) for name, of_family in plain.items()}
     main = max(counted, key=counted.get, default=None)
     for row in rows:
-        own = words[id(row)]
-        shown = {key: word.lstrip("+").replace(key, short[key], 1) for key, word in own.items()}
+        overrides = words[id(row)]
+        shown = {key: word.lstrip("+").replace(key, short[key], 1) for key, word in overrides.items()}
         is_main = row["ablation"] == "base" or (family_of(row) == main and counted[main] > 1)
         begin = family_of(row)[-1] or ("" if is_main else f"{row['method']}-{row['preset']}")
-        row |= {"setting": _text(own), "words": shown}
+        row |= {"setting": _text(overrides), "words": shown}
         row["variant"] = " ".join(filter(None, (begin, _text(shown)))) or "base"
     for same in grouped((row["variant"], row) for row in rows).values():
         if len({*map(family_of, same)}) > 1:
@@ -222,9 +224,9 @@ def _overrides(family: Sequence[Row]) -> dict[int, dict[str, str]]:
     """Return each row's overrides by their keys, by its id; rows are of one method, preset and ablation."""
     words: dict[int, dict[str, str]] = {}
     for same in grouped(((row["scene"], _identity(row)), row) for row in family).values():
-        known = [_stored(row) for row in same]
-        shared = [key for key in sorted(known[0]) if all(key in of_row for of_row in known)]
-        words |= {id(row): {key: known[0][key] for key in shared} for row in same}
+        stored = [_stored(row) for row in same]
+        shared = [key for key in sorted(stored[0]) if all(key in of_row for of_row in stored)]
+        words |= {id(row): {key: stored[0][key] for key in shared} for row in same}
     configured, used = [row for row in family if row.get("configuration") is not None], set()
     while key := _telling(configured, words, used):
         used.add(key)
@@ -264,11 +266,11 @@ def _word(key: str, value: object) -> dict[str, str]:
     return {name: f"{name}={''.join(text.split())}"}
 
 
-def value_text(key: str, own: Mapping[str, object]) -> str:
+def value_text(key: str, values: Mapping[str, object]) -> str:
     """Write the value of a key of a configuration; of a class its name, and null where there is none."""
-    if (target := own.get(f"{key}._target_")) is not None:
+    if (target := values.get(f"{key}._target_")) is not None:
         return str(target).rpartition(".")[2]
-    value = own.get(key)
+    value = values.get(key)
     is_whole = isinstance(value, float) and value.is_integer()
     return "null" if value is None else str(int(value)) if is_whole else str(value)
 
@@ -291,13 +293,13 @@ def _telling(rows: Sequence[Row], words: Mapping[int, Mapping], used: set[str]) 
     conditions; None where all are told apart.
     """
     cells = grouped((_cell(row, words), row["configuration"]) for row in rows)
-    told: dict[str, int] = {}
+    counts_of: dict[str, int] = {}
     for cell in cells.values():
-        found = list({frozenset(own.items()): own for own in cell}.values())
-        for key in {key for own in found for key in own} - used if len(found) > 1 else ():
-            told[key] = told.get(key, 0) + len({own.get(key) for own in found}) - 1
-    best = max(told.values(), default=0)
-    short = sorted(key for key, count in told.items() if count == best > 0)
+        distinct = list({frozenset(values.items()): values for values in cell}.values())
+        for key in {key for values in distinct for key in values} - used if len(distinct) > 1 else ():
+            counts_of[key] = counts_of.get(key, 0) + len({values.get(key) for values in distinct}) - 1
+    best = max(counts_of.values(), default=0)
+    short = sorted(key for key, count in counts_of.items() if count == best > 0)
     return min(short, key=lambda key: key.count(".") - 1.5 * key.endswith("._target_"), default=None)
 
 
@@ -308,13 +310,13 @@ def shortest(keys: Iterable[str]) -> dict[str, str]:
     dict_values(['rigid', 'motion', 'a.lr.x', 'b.lr.x'])
     """
     parts = {key: tuple(re.split(r"[./]", key)) for key in keys}
-    found = {}
-    for key, own in parts.items():
-        others = [other for other in parts.values() if other != own]
-        lengths = range(1, len(own) + 1)
-        n = next((n for n in lengths if all(other[-n:] != own[-n:] for other in others)), len(own))
-        found[key] = ".".join(own[-n:])
-    return found
+    short = {}
+    for key, of_key in parts.items():
+        others = [other for other in parts.values() if other != of_key]
+        lengths = range(1, len(of_key) + 1)
+        n = next((n for n in lengths if all(other[-n:] != of_key[-n:] for other in others)), len(of_key))
+        short[key] = ".".join(of_key[-n:])
+    return short
 
 
 def repeated(rows: Sequence[Row]) -> list[Row]:

@@ -96,15 +96,15 @@ def field(name: str, runs: Sequence[Row], where: str) -> Callable[[Row], object]
     parts = re.split(r"[./]", name)
     ends = [key for key in values if key.split(".")[-len(parts) :] == parts]
     differing = [key for key in ends if len(values[key]) > 1 or any(key not in _keys(row) for row in runs)]
-    found = [key for key in ends if key == ".".join(parts)] or (differing if len(differing) == 1 else ends)
-    known = f"{', '.join(dict.fromkeys(FIELDS))} or a key of config.yaml"
-    if not found:
-        raise ValueError(f"{where}: expected {known}, but got {name}")
-    if len(found) > 1:
+    matching = [key for key in ends if key == ".".join(parts)] or (differing if len(differing) == 1 else ends)
+    expected = f"{', '.join(dict.fromkeys(FIELDS))} or a key of config.yaml"
+    if not matching:
+        raise ValueError(f"{where}: expected {expected}, but got {name}")
+    if len(matching) > 1:
         raise ValueError(
-            f"{where}: expected one key, but got {name}, which ends {', '.join(sorted(found)[:4])}"
+            f"{where}: expected one key, but got {name}, which ends {', '.join(sorted(matching)[:4])}"
         )
-    return lambda row: value_text(found[0], row["configuration"])
+    return lambda row: value_text(matching[0], row["configuration"])
 
 
 def _keys(row: Row) -> set[str]:
@@ -121,7 +121,7 @@ def runs_by_cell(runs: Runs, rows: Sequence[str], columns: Sequence[str]) -> dic
         [field(name, runs, where) for name in names]
         for where, names in (("rows", rows), ("columns", columns))
     ]
-    placed = grouped((tuple(tuple(tell(row) for tell in side) for side in sides), row) for row in runs)
+    placed = grouped((tuple(tuple(read(row) for read in side) for side in sides), row) for row in runs)
     for key, of_cell in placed.items():
         name = next((n for n in SHARED if len({key_of(row, (n,)) for row in of_cell}) > 1), None)
         if name is not None:
@@ -129,9 +129,12 @@ def runs_by_cell(runs: Runs, rows: Sequence[str], columns: Sequence[str]) -> dic
             add = {"method": "model", "ablation": "variant", "setting": "variant"}.get(name, name)
             if name == "setting":
                 words = [row["words"] for row in of_cell]
-                keys = {k for own in words for k in own if len({other.get(k) for other in words}) > 1}
+                keys = {k for of_run in words for k in of_run if len({other.get(k) for other in words}) > 1}
                 values = sorted(
-                    {" ".join(own[k] for k in sorted(keys) if k in own) or "neither" for own in words}
+                    {
+                        " ".join(of_run[k] for k in sorted(keys) if k in of_run) or "neither"
+                        for of_run in words
+                    }
                 )
                 keys = {k for k in keys if all(k in _keys(row) for row in of_cell)}
                 add = min(keys, default="variant")
@@ -145,13 +148,13 @@ def runs_by_cell(runs: Runs, rows: Sequence[str], columns: Sequence[str]) -> dic
 
 def _order(values: tuple) -> list[tuple]:
     """Sort numbers by their size, and what is none after them by name."""
-    found = []
+    order = []
     for value in values:
         try:
-            found.append((0, float(value), ""))
+            order.append((0, float(value), ""))
         except (TypeError, ValueError):
-            found.append((1, 0.0, str(value)))
-    return found
+            order.append((1, 0.0, str(value)))
+    return order
 
 
 def _shown(value: object) -> str:
@@ -185,14 +188,14 @@ def table_of(
     """
     heads = list(dict.fromkeys(column for _, column in cells))
     titles = list(dict.fromkeys(row for row, _ in cells))
-    every = Runs(run for own in cells.values() for run in own)
+    every = Runs(run for of_cell in cells.values() for run in of_cell)
     absent = [name for name in metrics if all(value_of(run, name) is None for run in every)]
     if len(absent) == len(metrics) or not {*absent} <= {"lpips", *METRICS, *COSTS}:
         tested = (run["test"].get(run["ability"], {}) for run in every)
         scores = (name for of_run in tested for name, value in of_run.items() if value is not None)
-        known = dict.fromkeys([*scores, *COSTS])
+        choices = dict.fromkeys([*scores, *COSTS])
         kinds = dict.fromkeys(kind for run in every for kind in run["test"])
-        expected = f"{', '.join(known)}, or {'/, '.join(kinds)}/ before one"
+        expected = f"{', '.join(choices)}, or {'/, '.join(kinds)}/ before one"
         raise ValueError(f"metric: expected {expected}, but got {', '.join(absent)}, which no run has")
     lines: list[list] = [[_shown(value) for value in title] for title in titles]
     shown, marks = [Column(name, None) for name in rows], {}
@@ -204,11 +207,11 @@ def table_of(
             shown.append(Column(" ".join([*words, f"{heading}{'↑' if higher else '↓'}"]), digits))
             values = {}
             for i, title in enumerate(titles):
-                own = {run["seed"]: value_of(run, metric) for run in cells.get((title, head), ())}
-                values[i] = {seed: value for seed, value in own.items() if value is not None}
+                of_cell = {run["seed"]: value_of(run, metric) for run in cells.get((title, head), ())}
+                values[i] = {seed: value for seed, value in of_cell.items() if value is not None}
                 lines[i].append(Estimate.of(values[i].values()))
-            found = {i: own for i, own in values.items() if own and _alike(cells, head, rows)}
-            places = rank(found, higher)
+            ranked = {i: of_cell for i, of_cell in values.items() if of_cell and _alike(cells, head, rows)}
+            places = rank(ranked, higher)
             for place, mark in zip(places, ("best", "second")):
                 marks |= {(i, len(shown) - 1): mark for i in place}
     without = f" No run has {', '.join(absent)}." if absent else ""
@@ -229,19 +232,19 @@ def _labels(names: Sequence[str], values: Sequence[object]) -> list[str]:
 def _heading(metric: str) -> tuple[str, int, bool]:
     if metric in COSTS:
         return *COSTS[metric], False
-    known = metric_of(metric)
-    return known.heading, known.digits, known.higher_is_better
+    described = metric_of(metric)
+    return described.heading, described.digits, described.higher_is_better
 
 
 def _alike(cells: Mapping, head: tuple, rows: Sequence[str]) -> bool:
     """Tell whether the cells of a column may be ranked: they differ in no condition but those of the rows."""
     names = [name for name in ("scene", "dataset", "minutes", *CONDITIONS) if name not in rows]
-    return len({key_of(own[0], names) for (_, column), own in cells.items() if column == head}) == 1
+    return len({key_of(of_cell[0], names) for (_, column), of_cell in cells.items() if column == head}) == 1
 
 
 def caption(runs: Runs, cells: Mapping) -> str:
     """Say how many seeds cells are of, the budget, the machine, and what was measured."""
-    counts = sorted({len(own) for own in cells.values()})
+    counts = sorted({len(of_cell) for of_cell in cells.values()})
     seeds = (
         f"{counts[0]} seed{'s' * (counts[-1] > 1)}"
         if len(counts) == 1
@@ -257,18 +260,18 @@ def caption(runs: Runs, cells: Mapping) -> str:
     if [*kinds] != ["all"]:
         parts["scores"] = f"of the kind of test view {', '.join(kind.removeprefix('of ') for kind in kinds)}"
     parts |= {"images": "; ".join(dict.fromkeys(filter(None, (row["pictures"] for row in runs))))}
-    told = "; ".join(f"{name}: {text}" for name, text in parts.items() if text)
+    conditions = "; ".join(f"{name}: {text}" for name, text in parts.items() if text)
     marked = "" if max(counts) < 3 else " The best and the second of a column are marked; ties share a mark."
-    return f"{first}. {told[:1].upper()}{told[1:]}.{marked}"
+    return f"{first}. {conditions[:1].upper()}{conditions[1:]}.{marked}"
 
 
 def _budget(runs: Runs) -> str:
-    found = {}
+    budgets = {}
     for row in runs:
         minutes = [f"{length(row['minutes'])} ({row['clock']} clock)"] if row["minutes"] else []
         steps = [f"{row['iterations']:g} steps"] if row["iterations"] else []
-        found[" or ".join([*minutes, *steps]) or "of the preset"] = None
-    return ", ".join(found)
+        budgets[" or ".join([*minutes, *steps]) or "of the preset"] = None
+    return ", ".join(budgets)
 
 
 def draw_pareto(
@@ -296,14 +299,14 @@ def draw_pareto(
         for axis, (cost, label) in zip(line, PANELS.items()):
             points = {}
             for title in titles:
-                own = cells.get((title, head), Runs())
-                at, score = (Estimate.of(value_of(row, name) for row in own) for name in (cost, metric))
+                of_cell = cells.get((title, head), Runs())
+                at, score = (Estimate.of(value_of(row, name) for row in of_cell) for name in (cost, metric))
                 if at is not None and score is not None:
                     points[title] = at, score
             for title, (at, score) in points.items():
-                about = {"color": colors[title], "marker": signs[title], "linestyle": "none", "capsize": 2}
+                style = {"color": colors[title], "marker": signs[title], "linestyle": "none", "capsize": 2}
                 bars = {"xerr": at.error_bar, "yerr": score.error_bar, "elinewidth": 1, "markersize": 6}
-                axis.errorbar(at.mean, score.mean, label=", ".join(_labels(rows, title)), **bars, **about)
+                axis.errorbar(at.mean, score.mean, label=", ".join(_labels(rows, title)), **bars, **style)
             sign = 1 if higher else -1
             means = [(at.mean, sign * score.mean) for at, score in points.values()]
             front = [means[i] for i in pareto_front(means)]
