@@ -1,13 +1,15 @@
 """Where the error of a run is, and what to try: splits by hand, planted defects, keys that compose."""
 
+import json
 import math
 
+import numpy as np
 import pytest
 import torch
 from omegaconf import OmegaConf
 
-from forewarp.metrics.errors import blurred, split_errors
-from forewarp.report.diagnosis import KEYS, advice, diagnose, more_steps
+from forewarp.metrics.errors import SIGMAS, blurred, split_errors
+from forewarp.report.diagnosis import BLURS, KEYS, advice, diagnose, more_steps
 from forewarp.report.run_page import read_story
 from tests.report.test_run_page import told_run
 from tests.support.configs import CONF, composed
@@ -97,6 +99,54 @@ def test_shares_of_the_ends_are_of_squared_errors(tmp_path):
     assert "20% of the views hold 71% of the squared error" in first.text
 
 
+def test_the_worst_stretch_of_time_is_named_with_its_share(tmp_path):
+    folder = told_run(tmp_path, views=0, steps=200_000)
+    times = [i / 50 + 0.01 for i in range(50)]
+    write_views(folder, {f"r_{t:.2f}": (t, 20.0 if 0.4 < t < 0.6 else 30.0) for t in times})
+    diagnosis = diagnose(read_story(folder), fit={"images": 50})
+    assert [finding.kind for finding in diagnosis.findings] == ["stretch"]
+    first = diagnosis.findings[0]
+    # Ten views of 0.01 and forty of 0.001.
+    assert "Time 0.4 to 0.6: 20% of the views hold 71% of the squared error" in first.text
+    assert first.share == pytest.approx((0.1 - 0.01) / 0.14)
+    tenth = next(split for split in diagnosis.splits if split.name == "time 0.5 to 0.6")
+    assert (tenth.part, tenth.error, tenth.psnr) == pytest.approx((0.1, 0.05 / 0.14, 20.0))
+
+
+def smooth(generator, times, count):
+    """Errors (count, times) of mean 0 and deviation 1, smooth over a tenth of the time."""
+    covariance = np.exp(-(np.subtract.outer(times, times) ** 2) / (2 * 0.1**2)) + 1e-8 * np.eye(len(times))
+    return generator.standard_normal((count, len(times))) @ np.linalg.cholesky(covariance).T
+
+
+def test_errors_that_are_smooth_in_time_seldom_make_a_finding(tmp_path):
+    row, generator, runs = read_story(told_run(tmp_path, steps=1_000_000)), np.random.default_rng(0), 200
+    times, blurs = np.linspace(0, 1, 40).tolist(), [f"_{sigma:g}" for sigma in SIGMAS]
+    assert len(blurs) == BLURS
+    fired = 0
+    for _ in range(runs):
+        psnr, moving, exposure, *blur = smooth(generator, times, 3 + BLURS)
+        names = [f"r_{i:02d}" for i in range(len(times))]
+        scores = zip(names, times, (27 + psnr).tolist())
+        images = [{"name": n, "time": t, "psnr": score, "ability": "all"} for n, t, score in scores]
+        views = {}
+        for i, name in enumerate(names):
+            sums = {"all": (1.0, 100), "moving": (0.5 * 10 ** (0.1 * moving[i]), 50), "still": (0.5, 50)}
+            sums |= {"exposure": (10 ** (0.1 * exposure[i]), 100)}
+            for kind, change in zip(blurs, blur):
+                sums |= {f"blur{kind}": (10 ** (0.1 * change[i]), 100), f"blurrier{kind}": (1.0, 100)}
+            placed = {"gap": 0.5 * (i % 2), "degrees": 3.0 + 0.1 * i + 20 * (i // 3 % 2)}
+            views[name] = {"sums": sums, "ratio": 1.0, **placed}
+        fired += bool(diagnose(row | {"images": images}, views, {"images": 20}).findings)
+    assert fired <= 0.05 * runs
+
+
+def test_two_static_cameras_are_two_samples(tmp_path):
+    camera = lambda i: i // 2 % 2  # noqa: E731
+    folder = run_with(tmp_path, lambda i, time: 25.0 + 0.1 * (i % 3) + 3.0 * camera(i), steps=1_000_000)
+    assert diagnosed(folder, degrees=lambda i: 30.0 - 28.0 * camera(i)).findings == []
+
+
 def scene(i):
     """A textured subject before white, a part of it that moves, and a good rendering, of view ``i``."""
     subject, moving = square_mask(16, 80), square_mask(60, 72)
@@ -136,13 +186,16 @@ def test_without_a_defect_pixels_say_nothing(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("kind", "known"),
-    [("far", {"degrees": lambda i: 30.0 if i % 2 else 2.0}), ("between", {"gap": lambda i: 0.5 * (i % 2)})],
+    ("kind", "placed"),
+    [
+        ("far", {"degrees": lambda i: 2.0 + 28 * (i % 2) + 0.1 * i}),
+        ("between", {"gap": lambda i: 0.5 * (i % 2)}),
+    ],
 )
-def test_a_defect_of_views_comes_first(tmp_path, kind, known):
+def test_a_defect_of_views_comes_first(tmp_path, kind, placed):
     by_turns = lambda i, time: 20.0 + 0.1 * (i % 3) + 10.0 * (i % 2 == 0)  # noqa: E731
     folder = run_with(tmp_path, by_turns, steps=100_000)
-    first = diagnosed(folder, fit={"images": 20, "spacing": 4.0, "psnr": 30.0}, **known).findings[0]
+    first = diagnosed(folder, fit={"images": 20, "spacing": 4.0, "psnr": 30.0}, **placed).findings[0]
     assert first.kind == kind
     # Half the views have ten times the error of the others.
     assert first.brings == pytest.approx(-10 * math.log10(2 / 11), abs=0.2)
@@ -172,12 +225,44 @@ def test_too_few_steps_come_first_unless_the_curve_is_flat(tmp_path):
     assert diagnosed(flat, fit={"images": 50}).findings == []
 
 
+@pytest.mark.parametrize(
+    ("steps", "budget", "share", "done", "try_"),
+    [
+        (400, {"minutes": 1.0, "iterations": None}, 8, {}, "stage.coarse.steps_per_picture=32"),
+        (399, {"minutes": 1.0, "iterations": None}, 8, {}, "budget.minutes=4.0"),
+        (300, {"minutes": 1.0, "iterations": 300}, 8, {}, "budget.iterations=1200"),
+        (300, {"minutes": 1.0, "iterations": 300}, None, {}, "budget.iterations=1200"),
+        (300, {"minutes": 1.0, "iterations": None}, None, {"reached": "target.psnr"}, "target.psnr=null"),
+    ],
+)
+def test_the_limit_that_ended_the_training_is_the_one_to_raise(tmp_path, steps, budget, share, done, try_):
+    config = {"stage": {"coarse": {"share": 1.0, "steps_per_picture": share}}, "budget": budget}
+    folder = run_with(tmp_path, steps=steps, config=config | {"target": {"psnr": 25.0}})
+    (folder / "coarse" / "done.json").write_text(
+        json.dumps({"steps": steps, "seconds": 50.0, "target": done})
+    )
+    first = diagnosed(folder, fit={"images": 50}).findings[0]
+    assert (first.kind, first.try_) == ("training", try_)  # after fewer than ten steps an image, four times
+
+
+def test_of_very_many_steps_nothing_stands_out(tmp_path):
+    folder = run_with(tmp_path, steps=130_000 * 50, curve=None)
+    assert diagnosed(folder, fit={"images": 50}).findings == []
+
+
+def test_a_share_of_draws_stays_a_share():
+    config = {"model": {"name": "forward"}, "stage": {"fine": {"curriculum": {"ends_share": 0.9}}}}
+    assert advice("ends", config)[0] == "stage.fine.curriculum.ends_share=1.0"
+    config["stage"]["fine"]["curriculum"]["ends_share"] = 1.0
+    assert advice("ends", config)[0] == "model=particles"
+
+
 def test_a_few_views_say_nothing_of_groups(tmp_path):
     folder = told_run(tmp_path, views=0)
     write_views(folder, {f"r_{i}": (i / 2, 10.0 * (i + 1)) for i in range(3)})
-    found = diagnose(read_story(folder), {"r_0": {"sums": defect("moving", 0), "ratio": 1.0}})
-    assert found.findings == []
-    assert [view["name"] for view in found.worst] == ["r_0", "r_1", "r_2"]
+    diagnosis = diagnose(read_story(folder), {"r_0": {"sums": defect("moving", 0), "ratio": 1.0}})
+    assert diagnosis.findings == []
+    assert [view["name"] for view in diagnosis.worst] == ["r_0", "r_1", "r_2"]
     assert diagnose(read_story(told_run(tmp_path, views=0, seed=1))) is None
 
 
@@ -216,6 +301,14 @@ def test_every_key_to_try_composes_for_its_model_and_changes_something(model, pr
         else:
             path = key.lstrip("+").replace("/", ".")
             assert value_at(changed, path) != value_at(config, path), key
+
+
+def test_a_limit_of_steps_composes():
+    words = "experiment=multicam", "data.scene=x", "model=particles"
+    config = OmegaConf.to_container(composed(*words), resolve=True)
+    limit = "stage.fine.steps_per_picture"
+    typed, _ = advice("training", config, 100.0, limit)
+    assert value_at(composed(*words, typed), limit) == 2 * value_at(config, limit) == 2600
 
 
 def test_keys_follow_the_value_that_the_run_has():

@@ -11,7 +11,16 @@ import yaml
 
 from forewarp.drawing.images import write_png, write_video
 from forewarp.metrics.registry import METRICS, Metric
-from forewarp.report.run_page import Axis, Media, Shown, chart, media_of, read_story, telling, write_run_page
+from forewarp.report.run_page import (
+    Axis,
+    Media,
+    Shown,
+    best_median_worst,
+    chart,
+    media_of,
+    read_story,
+    write_run_page,
+)
 from tests.support.runs_on_disk import write_run, write_views
 
 NASTY = "<img src=x onerror=alert(1)>&\"'</script>"
@@ -218,7 +227,11 @@ def test_losses_are_against_the_clock_of_training(fitted):
 
 def test_one_view_is_the_best_of_all():
     views = [{"name": "a", "time": 0.5, "psnr": 30.0}, {"name": "b", "time": 0.6, "psnr": 20.0}]
-    assert [telling(views[:count]) for count in (0, 1, 2)] == [{}, {"a": "best"}, {"a": "best", "b": "worst"}]
+    assert [best_median_worst(views[:count]) for count in (0, 1, 2)] == [
+        {},
+        {"a": "best"},
+        {"a": "best", "b": "worst"},
+    ]
 
 
 def test_of_many_views_some_are_drawn_and_the_lowest_too(tmp_path):

@@ -184,13 +184,14 @@ def run_page(config: DictConfig) -> str:
 
 
 def _render(config: DictConfig, row: dict, media) -> None:
-    """Render the telling views, and a player or, where there can be none, the video if the run has none;
-    ``media`` takes each once it is made. First find out where the error of the stored views is.
+    """Render the best, the median and the worst view, and a player or, where there can be none, the video if
+    the run has none; ``media`` takes each once it is made. First find out where the error of the stored views
+    is.
     """
     from forewarp.cli.export import source_of
     from forewarp.evaluation.images import parts_of
     from forewarp.methods.method import HasMovingGaussians
-    from forewarp.report.run_page import FILMS, Shown, about, room_of, telling
+    from forewarp.report.run_page import FILMS, Shown, about, best_median_worst, room_of
     from forewarp.runs.config import saved_config
     from forewarp.runs.fitted import method_name, opened
 
@@ -200,7 +201,7 @@ def _render(config: DictConfig, row: dict, media) -> None:
     _diagnose(row, media, run, module)
     places = {frame.name: number for number, frame in enumerate(targets.frames)}
     views = []
-    for name, why in telling(row["images"]).items():
+    for name, why in best_median_worst(row["images"]).items():
         if name in places:
             target = targets[places[name]]
             side = max(target.frame.camera.width, target.frame.camera.height)

@@ -161,11 +161,11 @@ def _between(known: Sequence[tuple[int, float]], step: int) -> float:
     return begin + (end - begin) * (step - low) / (high - low)
 
 
-def telling(images: Sequence[dict]) -> dict[str, str]:
+def best_median_worst(images: Sequence[dict]) -> dict[str, str]:
     """Choose the views to look at: the best, the middle one and the worst by PSNR.
 
     >>> seen = [{"name": n, "psnr": p} for n, p in (("a", 30), ("b", 20), ("c", 40))]
-    >>> telling(seen), telling(seen[:2])
+    >>> best_median_worst(seen), best_median_worst(seen[:2])
     ({'c': 'best', 'a': 'median', 'b': 'worst'}, {'a': 'best', 'b': 'worst'})
     """
     ranked = [image["name"] for image in sorted(images, key=lambda image: (-image["psnr"], image["name"]))]
@@ -180,8 +180,8 @@ def media_of(row: Row, path: str | None = None) -> Media:
     """Return what the folder has: truth, prediction and error of views, where the error is as far as these
     tell, and a video made after training.
 
-    Of the telling views those that have a sheet; then others, named for what they are among those with one;
-    without any the last picture that training drew.
+    Of the best, the median and the worst view those that have a sheet; then others, named for what they are
+    among those with one; without any the last picture that training drew.
 
     Args:
         row: the run.
@@ -191,8 +191,8 @@ def media_of(row: Row, path: str | None = None) -> Media:
 
     sheets, shown = sheets_of(row["folder"]), []
     drawn = [image for image in row["images"] if image["name"] in sheets]
-    chosen = {name: f"{why} of {len(drawn)} drawn" for name, why in telling(drawn).items()}
-    chosen |= {name: why for name, why in telling(row["images"]).items() if name in sheets}
+    chosen = {name: f"{why} of {len(drawn)} drawn" for name, why in best_median_worst(drawn).items()}
+    chosen |= {name: why for name, why in best_median_worst(row["images"]).items() if name in sheets}
     files = [(why, about(row, name), sheets[name]) for name, why in chosen.items()]
     files.sort(key=lambda file: WHYS.index(file[0].split()[0]))
     for stage in () if files else [*row["config"].get("stage", {})][::-1]:
