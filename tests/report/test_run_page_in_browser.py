@@ -36,8 +36,8 @@ def file(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def browser():
-    with chromium() as found:
-        yield found
+    with chromium() as chrome:
+        yield chrome
 
 
 @pytest.fixture(params=[1280, 390])
@@ -101,8 +101,8 @@ def test_nothing_is_wider_than_the_page_and_the_video_plays(tab):
     until(lambda: video.evaluate("video => video.currentTime > 0.2 && video.videoWidth == 32"))
     # Last, as a browser pauses what it has scrolled away.
     tab.page.locator("summary").click()
-    wide, own = tab.page.evaluate("[document.documentElement.scrollWidth, innerWidth]")
-    assert wide <= own
+    wide, room = tab.page.evaluate("[document.documentElement.scrollWidth, innerWidth]")
+    assert wide <= room
     assert tab.page.locator("svg").count() == 2
     assert min(box["height"] for box in (one.bounding_box() for one in tab.page.locator("svg").all())) > 100
 

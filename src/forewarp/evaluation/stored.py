@@ -44,8 +44,8 @@ def stored_views(
         if prediction.shape != target.rgb.shape:
             continue
         valid = ... if target.valid is None else target.valid
-        known = prediction[valid].reshape(1, -1, 3), target.rgb[valid].reshape(1, -1, 3)
-        if abs(psnr(*known) - scores[name]) < _SLACK:
+        colors = prediction[valid].reshape(1, -1, 3), target.rgb[valid].reshape(1, -1, 3)
+        if abs(psnr(*colors) - scores[name]) < _SLACK:
             yield target, prediction
 
 
@@ -97,7 +97,7 @@ def placed(scene: Scene) -> tuple[dict[str, dict], dict]:
     cameras = [frame.camera for frame in scene.train]
     focus = focus_point(cameras).double() if len(cameras) > 1 else None
     views = {frame.name: {} for frame in scene.test}
-    about = {"images": len(scene.train), "spacing": None}
+    training = {"images": len(scene.train), "spacing": None}
     times = scene.times
     if len(times) > 1:
         step = median(b - a for a, b in zip(times, times[1:]))
@@ -109,12 +109,12 @@ def placed(scene: Scene) -> tuple[dict[str, dict], dict]:
         near[near < 1e-3] = math.inf  # itself, and those at the same place
         spacing = near.amin(1)
         if bool(spacing.isfinite().all()):
-            about["spacing"] = float(spacing.median())
+            training["spacing"] = float(spacing.median())
         if scene.test:
             least = _degrees(_directions([frame.camera for frame in scene.test], focus), trained).amin(1)
             for frame, degrees in zip(scene.test, least.tolist()):
                 views[frame.name]["degrees"] = degrees
-    return views, about
+    return views, training
 
 
 def _directions(cameras: Sequence[Camera], focus: Tensor) -> Tensor:

@@ -52,19 +52,19 @@ def split_errors(
     counted = torch.ones_like(square, dtype=torch.bool) if valid is None else valid
     share = 1.0 if foreground is None else float(foreground.float().mean())
     subject = foreground if 0 < share < _WHOLE else None
-    groups, looked = {"all": counted}, counted
+    groups, examined = {"all": counted}, counted
     if subject is not None:
         reach = max(1, round(_RIM * min(subject.shape)))
         rim = _grown(subject, reach) & _grown(~subject, reach)
         groups |= {"outline": rim & counted, "inside": subject & ~rim & counted}
         groups["beside"] = ~subject & ~rim & counted
-        looked = groups["inside"]
+        examined = groups["inside"]
     if moving is not None:
         within = counted if subject is None else subject & counted
         groups |= {"moving": moving & within, "still": ~moving & within}
     sums = {name: Sums(float(square[mask].sum()), int(mask.sum())) for name, mask in groups.items()}
-    if (lit := _lit(prediction, truth, looked)) is not None:
-        after = square.where(~looked, (lit - truth).square().mean(-1))
+    if (lit := _lit(prediction, truth, examined)) is not None:
+        after = square.where(~examined, (lit - truth).square().mean(-1))
         sums["exposure"] = Sums(float(after[counted].sum()), sums["all"].count)
     for sigma in SIGMAS:
         for name, pair in (
@@ -73,29 +73,33 @@ def split_errors(
         ):
             after = (pair[0] - pair[1]).square().mean(-1)
             sums[f"{name}_{sigma:g}"] = Sums(float(after[counted].sum()), sums["all"].count)
-    ratio = float(truth[looked].mean() / prediction[looked].mean().clamp(min=1e-6)) if looked.any() else 1.0
-    return {name: found for name, found in sums.items() if found.count}, ratio
+    ratio = (
+        float(truth[examined].mean() / prediction[examined].mean().clamp(min=1e-6)) if examined.any() else 1.0
+    )
+    return {name: of for name, of in sums.items() if of.count}, ratio
 
 
 def _grown(mask: Tensor, reach: int) -> Tensor:
     return F.max_pool2d(mask[None].float(), 2 * reach + 1, 1, reach)[0] > 0
 
 
-def _lit(prediction: Tensor, truth: Tensor, looked: Tensor) -> Tensor | None:
-    """Return the prediction (H, W, 3) with the exposure of the truth; None where too little is ``looked`` at.
+def _lit(prediction: Tensor, truth: Tensor, examined: Tensor) -> Tensor | None:
+    """Return the prediction (H, W, 3) with the exposure of the truth; None where too little is ``examined``.
 
     Means of blocks are fitted, as what is misplaced by a few pixels would look like a loss of contrast.
     """
-    side = max(1, min(looked.shape) // _BLOCKS)
-    weight = F.avg_pool2d(looked[None].float(), side, ceil_mode=True)[0]
+    side = max(1, min(examined.shape) // _BLOCKS)
+    weight = F.avg_pool2d(examined[None].float(), side, ceil_mode=True)[0]
 
     def means(image: Tensor) -> Tensor:
-        masked = (image * looked[..., None]).permute(2, 0, 1)
+        masked = (image * examined[..., None]).permute(2, 0, 1)
         return F.avg_pool2d(masked, side, ceil_mode=True) / weight.clamp(min=1e-6)
 
     x, y = means(prediction).double(), means(truth).double()
     odd = (torch.arange(weight.shape[0])[:, None] + torch.arange(weight.shape[1])) % 2 == 1
-    place = odd.repeat_interleave(side, 0).repeat_interleave(side, 1)[: looked.shape[0], : looked.shape[1]]
+    place = odd.repeat_interleave(side, 0).repeat_interleave(side, 1)[
+        : examined.shape[0], : examined.shape[1]
+    ]
     lit = prediction.clone()
     for fitted, applied in ((odd, ~place), (~odd, place)):
         chosen = fitted & (weight > 0.5)
