@@ -6,7 +6,13 @@ from types import SimpleNamespace
 import pytest
 from omegaconf import OmegaConf
 
-from forewarp.cli.prepare import READ, refuse_missing_scene, refuse_numbers, refuse_unwatched
+from forewarp.cli.prepare import (
+    READ,
+    refuse_missing_scene,
+    refuse_numbers,
+    refuse_target_without_curve,
+    refuse_unwatched,
+)
 from forewarp.data import module as data_module
 from forewarp.data.files import LAYOUTS, SceneError
 from forewarp.training.stopping import StopRule
@@ -64,6 +70,16 @@ def test_a_scene_is_told_by_the_file_that_its_reader_asks_for(name, tmp_path):
 def test_every_module_that_reads_a_folder_has_a_layout():
     modules = (each for each in vars(data_module).values() if hasattr(each, "_reader"))
     assert {each.__name__ for each in modules} == {*READ}
+
+
+def test_a_target_needs_the_curve_that_it_is_read_from():
+    config = OmegaConf.create({"target": {"psnr": None, "plateau": 1.0}, "callbacks": {"accuracy": {}}})
+    refuse_target_without_curve(config)
+    config.callbacks.accuracy = None
+    with pytest.raises(ValueError, match="^callbacks.accuracy: expected the curve that a target"):
+        refuse_target_without_curve(config)
+    config.target.plateau = None
+    refuse_target_without_curve(config)
 
 
 def test_a_target_needs_views_that_are_not_trained_on():

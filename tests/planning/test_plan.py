@@ -10,8 +10,11 @@ from forewarp import clock
 from forewarp.data.module import SceneDataModule
 from forewarp.methods.particles.model import Particles
 from forewarp.methods.voxel.forward import ForwardWarp
+from forewarp.planning import plan as planning
 from forewarp.planning.plan import refuse
 from forewarp.planning.plan_file import read_plan, with_plan, write_plan
+from forewarp.runs.build import build_run
+from forewarp.runs.config import plain
 from forewarp.synth.scenes import synthesize
 
 TINY = ["data=dnerf", "preset=demo", "trainer=cpu", "logger=none"]
@@ -111,6 +114,15 @@ def test_a_plan_depends_neither_on_the_budget_nor_on_the_clock(made, monkeypatch
         assert "% of the budget, on top of it" in " ".join(printed.split())
         for key in ("overrides", "effects", "evidence"):
             assert hasty[key] == plan[key], key
+
+
+def test_a_run_with_a_target_is_planned_by_a_still_fit_without(forewarp, stills, in_tmp, monkeypatch):
+    targets = []
+    monkeypatch.setattr(planning, "build_run", lambda c: targets.append(plain(c.target)) or build_run(c))
+    monkeypatch.setattr(Particles, "still_steps", 2)
+    typed = [word for word in TINY if "accuracy" not in word] + [f"data.root={stills}", "data.scene=still"]
+    done = forewarp("plan", "model=particles", *typed, "target.psnr=60")
+    assert (done.status, targets) == (0, [{"psnr": 60, "plateau": None}, None]), done.err
 
 
 def test_what_is_typed_changes_no_evidence(made, monkeypatch):

@@ -18,7 +18,7 @@ from forewarp.cli.mistakes import of_another
 from forewarp.cli.view import require_viewer
 from forewarp.data.files import mismatch, number, one_of, scene_folder, whole
 from forewarp.files import MOST_CONFIG, read_text, replace_file
-from forewarp.runs.config import check_planned, check_values, hashed, is_swept, resumed, trust_of
+from forewarp.runs.config import check_planned, check_values, hashed, is_swept, resumed, set_value, trust_of
 from forewarp.runs.overrides import key_of, typed_overrides
 
 if TYPE_CHECKING:  # loads torch
@@ -149,6 +149,7 @@ def refuse_all(config: DictConfig) -> None:
         raise ValueError(f"preset: {expected}, but got compact beside model={model}")
     refuse_other_methods(config)
     refuse_numbers(config, "views", "sheets", "reduce")
+    refuse_target_without_curve(config)
     check_values(config)
 
 
@@ -173,6 +174,13 @@ def refuse_missing_start(config: DictConfig) -> None:
     if not any(Path(config.run).glob("*/last.ckpt")) and not any(Path(start).glob("*/done.json")):
         advice = "make it by the same command with windows=still, without data.window and start"
         raise mismatch("start", "a finished run of what stands still", f"none in {start}", advice)
+
+
+def refuse_target_without_curve(config: DictConfig) -> None:
+    """Refuse a target where the curve that it is read from is switched off."""
+    if set_value(config, "target") is not None and (config.get("callbacks") or {}).get("accuracy") is None:
+        advice = "leave out callbacks.accuracy=null and debug=, which switches it off, or the target"
+        raise mismatch("callbacks.accuracy", "the curve that a target is read from", "null", advice)
 
 
 def refuse_unwatched(run: Run) -> None:

@@ -148,7 +148,7 @@ def _still_fit(planned: Run, overrides: list[str], steps: int, folder: Path, clo
     config = compose("train", without_switched_off(overrides))
     with open_dict(config):
         config.run, config.effects, config.evaluate = str(folder), "given", False
-        config.logger, config.callbacks, config.start = None, {}, None
+        config.logger, config.callbacks, config.start, config.target = None, {}, None, None
         config.budget = {"clock": clock.kind, "minutes": None, "iterations": steps}
         for stage in planned.stages:
             model, settings = stage.model or planned.model, config.stage[stage.settings.name]
