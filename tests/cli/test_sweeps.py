@@ -12,9 +12,11 @@ from pathlib import Path
 import psutil
 import pytest
 import yaml
+from omegaconf import OmegaConf
 
 from forewarp.files import read_rows
 from forewarp.report.settings import shortest
+from forewarp.runs import jobs
 from forewarp.runs.overrides import key_of
 from forewarp.synth.scenes import synthesize
 from tests.support.configs import ROOT
@@ -214,6 +216,24 @@ def test_jobs_that_fail_are_named_and_stop_no_other(launcher, start, tmp_path):
     listed = [line for line in failed.splitlines() if line.startswith("  forewarp-train ")]
     assert ["data.scene=lego" in line for line in listed] == [True]  # what Ray passes on may come later
     assert len(measured(tmp_path)) == 1
+
+
+def test_a_cost_that_cannot_be_told_ends_a_command_that_asks_for_it_alone(
+    refused, in_tmp, monkeypatch, capsys
+):
+    words = ["train", "--multirun", "experiment=demo", "data.root=nowhere", "plan_only=true"]
+    line = "budget.minutes: expected a number > 0 or null, but got 'abc'"
+    assert refused(*words, "budget.minutes=abc,1") == line
+    assert refused(*words, "budget.iterations=-1,1").startswith("budget.iterations: expected a number > 0")
+
+    def fails(*_, **__):
+        raise RuntimeError("no\nidea")
+
+    monkeypatch.setattr(jobs, "tell_sweep", fails)
+    assert refused(*words, "seeds=2") == "RuntimeError: no; idea"
+    assert not [*in_tmp.iterdir()]
+    jobs.TellCost().on_multirun_start(OmegaConf.create({"plan_only": False}))  # goes on
+    assert capsys.readouterr().out == "no estimate: no idea\n"
 
 
 @pytest.mark.slow

@@ -167,8 +167,11 @@ def _run(name: str, task: Callable, conf: Path, config_name: str) -> list[int]:
         ended = Path(folder) / "ended"
         ended.touch()
         try:
-            with suppress(PlanOnly):
-                hydra.main(version_base="1.3", config_path=str(conf), config_name=config_name)(job)()
+            hydra.main(version_base="1.3", config_path=str(conf), config_name=config_name)(job)()
+        except PlanOnly as ended_by:
+            if (error := ended_by.error) is not None:  # no job began, so none says what is wrong
+                error = error if one_line(error) else ValueError(f"{type(error).__name__}: {error}")
+                return [_tell(name, error, config_name)]
         finally:  # a sweeper may fail, too
             jobs = [json.loads(line) for line in ended.read_text().splitlines()]
             if len(jobs) > 1:

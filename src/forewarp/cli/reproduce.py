@@ -52,7 +52,7 @@ from types import SimpleNamespace
 import yaml
 
 from forewarp.cli.entry import INTERRUPTED, MISTAKE, arguments_of, project_root
-from forewarp.cli.mistakes import one_line
+from forewarp.cli.mistakes import flat, one_line
 from forewarp.data.files import one_of
 from forewarp.runs import overrides
 from forewarp.runs.config_files import configurations
@@ -439,10 +439,12 @@ def main() -> None:
     try:
         if plan_only or not keys.small:
             print(*cost_of(job), sep="\n", flush=True)
-    except Exception as error:  # else the sweep with the mistake says so
+    except Exception as error:
+        line = one_line(error) or flat(str(error))
         if plan_only:
-            print(f"forewarp-reproduce: error: {one_line(error) or error}", file=sys.stderr)
+            print(f"forewarp-reproduce: error: {line}", file=sys.stderr)
             sys.exit(MISTAKE)
+        print(f"no estimate: {line}", flush=True)  # the sweep with the mistake ends with it
     try:
         sys.exit(0 if plan_only else run(job))
     except KeyboardInterrupt:

@@ -162,7 +162,16 @@ def job_of(config: DictConfig, rows: Sequence[Row] = ()) -> Job:
     Args:
         config: composed; its ``run`` is filled in.
         rows: of jobs of this machine, which know the test views of a procedural scene not yet written.
+
+    Raises:
+        ValueError: for a budget that there cannot be.
     """
+    from forewarp.clock import Clock
+    from forewarp.training.schedule import check_budget
+
+    budget = config.budget
+    check_budget(budget.minutes, budget.iterations)
+    Clock(budget.clock)
     config = hashed(config)
     folder, like = Path(str(config.run)), likeness(config)
     state = "finished" if _is_finished(config, folder) else ""
@@ -177,7 +186,6 @@ def job_of(config: DictConfig, rows: Sequence[Row] = ()) -> Job:
     stages = [stage for stage in config.stage.values() if stage is not None]
     may_end = any(stage.get("steps_per_picture") is not None for stage in stages)
     may_end |= any(dB is not None for dB in (plain(config.get("target")) or {}).values())
-    budget = config.budget
     like = Row(**{**vars(like), "views": views, "pixels": pixels})
     plans = config.get("effects") == "auto"
     return Job(

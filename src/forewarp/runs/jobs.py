@@ -13,30 +13,37 @@ from hydra import compose
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.errors import HydraException
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import OmegaConfBaseException
 
 from forewarp.runs.cost import PRICES, Cost, Job, Total, cost_of, job_of, own_file, read_costs, spell, total
 from forewarp.runs.overrides import key_of
 
 
 class PlanOnly(SystemExit):
-    """Ends a command that was asked for its cost alone, before any job."""
+    """Ends a command that was asked for its cost alone, before any job; ``error``: why there is none."""
+
+    def __init__(self, error: Exception | None = None) -> None:
+        super().__init__()
+        self.error = error
 
 
 class TellCost(Callback):
     """Say before a sweep what its jobs will cost; with ``plan_only`` list them, and end there."""
 
     def on_multirun_start(self, config: DictConfig, **_) -> None:
-        """Print it; a sweep that cannot be composed is refused by the sweeper itself."""
+        """Print it; where that fails say so, and the sweep goes on: it refuses what is wrong with itself."""
+        failed = None
         try:
             print(*tell_sweep(config, listed=config.plan_only), sep="\n", flush=True)
-        except (HydraException, OmegaConfBaseException, ValueError, OSError, ImportError):
-            return
+        except Exception as error:
+            failed = error
+            if not config.plan_only:
+                print(
+                    f"no estimate: {' '.join(str(error).split()) or type(error).__name__}"[:200], flush=True
+                )
         if config.plan_only:
-            raise PlanOnly(0)
+            raise PlanOnly(failed)
 
 
 def tell_sweep(config: DictConfig, *, listed: bool = False) -> list[str]:

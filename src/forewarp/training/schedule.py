@@ -128,6 +128,13 @@ class StagePlan:
         self.share, self.objective, self.model, self.settings = share, objective, model, settings
 
 
+def check_budget(minutes: object, iterations: object) -> None:
+    """Raise ValueError for a bound of a run that is neither a number > 0 nor None."""
+    for key, bound in (("minutes", minutes), ("iterations", iterations)):
+        if bound is not None:
+            check_number(f"budget.{key}", bound, "a number > 0 or null", lambda bound: bound > 0)
+
+
 def share_out(
     plans: Mapping[str, StagePlan], *, minutes: float | None, iterations: int | None
 ) -> list[Stage]:
@@ -145,9 +152,7 @@ def share_out(
     for name, plan in plans.items():
         wanted = f"a number > 0, or ~stage.{name} to drop it"
         check_number(f"stage.{name}.share", plan.share, wanted, lambda share: share > 0)
-    for key, bound in (("minutes", minutes), ("iterations", iterations)):
-        if bound is not None:
-            check_number(f"budget.{key}", bound, "a number > 0 or null", lambda bound: bound > 0)
+    check_budget(minutes, iterations)
     whole, stages = sum(plan.share for plan in plans.values()), []
     for name, plan in plans.items():
         bounds = {
