@@ -28,7 +28,16 @@ def in_groups(form: str, firsts, lasts) -> list[str]:
         (in_groups("cam{}/DSC_{:04d}", range(6), range(1, 5)), [0, 1, 2, 3] * 6),
         (in_groups("cam{}_frame{:02d}", range(2), range(3)), [0, 1, 2] * 2),
         (in_groups("frame_{1:05d}_{0}", range(2), (1, 3)), [0, 2] * 2),
-        (in_groups("{}/{:03d}", range(3), range(4)), [0, 1, 2, 3] * 3),  # a folder for each camera
+        (in_groups("{}/{:03d}", "ab", range(4)), [0, 1, 2, 3] * 2),  # a folder for each camera
+        (["Screenshot 2024-05-01 at 10.30.59", "Screenshot 2024-05-01 at 10.31.06"], [0, 7]),
+        ([f"2024-05-01 at {t}" for t in ("11.50.00 AM", "12.10.00 PM", "1.30.00 PM")], [0, 1200, 6000]),
+        (["cap_103310", "cap_103400"], [0, 50]),
+        (["20240501_1045", "20240501_1115"], [0, 1800]),
+        (["DJI_20240501120000_0001", "DJI_20240501124400_0002", "DJI_20240501124401_0003"], [0, 2640, 2641]),
+        (["vlcsnap-00h00m09s200", "vlcsnap-00h01m02s300"], [0, 53100]),
+        (["DJI_0998", "DJI_0999", "DJI_0001", "DJI_0002"], [0, 1, 3, 4]),
+        (["t_0.0", "t_0.9", "t_1.5"], [0, 0.9, 1.5]),
+        ([f"{serial}/16123456780{t}" for serial in (22139905, 33) for t in ("00", "33")], [0, 33] * 2),
         ([f"IMG_{i:04d}_2024010112000{i}" for i in range(3)], [0, 1, 2]),
         (["train/0001", "train/0005", "test/0003"], [0, 4, 2]),
     ],
@@ -43,6 +52,12 @@ def test_where_cameras_are_tells_a_rig(form):
     found = read_names(in_groups(form, range(3), range(4)), "t.json", centers=RIG)
     assert found.frames == [0, 1, 2, 3] * 3
     assert len({*found.cameras}) == 3
+
+
+@pytest.mark.parametrize("form", ["{1:06d}/{0}", "img/{1}/img_{0:04d}", "a_{1:05d}_{0}"])
+def test_where_cameras_are_tells_which_number_is_theirs(form):
+    found = read_names(in_groups(form, range(3), range(4)), "t.json", centers=RIG)
+    assert found.frames == [0, 1, 2, 3] * 3
 
 
 @pytest.mark.parametrize("form", ["{}_{:03d}", "part{}/{:03d}", "1_{}_{:03d}"])
@@ -60,6 +75,12 @@ def test_where_cameras_are_tells_one_film(form):
         ([f"r_{i:03d}" for i in range(30)] + ["r_90000"], "number of r_90000: expected .* 1 to 28"),
         (in_groups("train/{1:03d}{0}", [""], range(150)) + in_groups("test/{1:03d}{0}", [""], range(20)),
          "one numbering of all images, 0 to 149, but got 0 to 19 for 'test/000'"),
+        (in_groups("{}/{:03d}", range(3), range(4)), "names as '0/000': number 1 .*, or number 2 .*, or all"),
+        (in_groups("img/{1}/img_{0:04d}", range(3), range(4)), "names that tell times in one way"),
+        ([f"frame_{i}" for i in range(-5, 6)], "what is beside the numbers differs"),
+        (in_groups("20231115_1704{:02d}_{:02d}", range(9), range(3)), "names that tell times in one way"),
+        (["t_1.000e-05", "t_2.000e-05"], "numbers with exponents"),
+        (["cap_235000", "cap_235900", "cap_001000"], "times of day more than half a day apart"),
         ([f"{c}_{i}" for c, n in ((1, 9), (2, 5)) for i in range(n)], "names that tell times in one way"),
     ],
 )  # fmt: skip
@@ -68,7 +89,14 @@ def test_names_of_several_readings_are_refused(names, said):
         read_names(names, "t.json")
 
 
+@pytest.mark.parametrize("form", ["seq-{:02d}/frame-{:06d}", "clip{}_frame{:04d}", "c{}_{:05d}"])
+def test_words_that_positions_contradict_are_refused(form):
+    with refused("positions continue one path; .*data.name_pattern"):
+        read_names(in_groups(form, range(3), range(4)), "t.json", centers=PATH)
+
+
 def test_names_that_say_nothing():
+    assert read_names([], "t.json") is None
     assert read_names(["left", "right"], "t.json") is None
     assert read_names(["a/1", "a/01", "b/7"], "t.json") is None  # one number twice
     assert read_names([f"cam{i}" for i in range(4)], "t.json") is None
@@ -88,7 +116,7 @@ def test_a_pattern_settles_every_case():
         ("[0-9]+", "a group named time or frame, .* but got neither"),
         (r"x(?P<frame>\d+)", "to be found in every name of t.json, but got not in '0_004'"),
         (r"_(?P<frame>\d+)", "each frame once, but got 4 again in '1_004'; name the camera by a group"),
-        (r"(?P<frame>_)", "group frame: expected a number, but got '_'"),
+        (r"(?P<frame>_)", "group frame: expected a number, but got '_' of '0_004'"),
     ],
 )
 def test_a_pattern_that_cannot_be_used_is_refused(pattern, said):

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import datetime, timezone
 from statistics import median
 from typing import NamedTuple
 
 import numpy as np
 
-from forewarp.data.files import mismatch
+from forewarp.data.files import SceneError, mismatch
 
 KEY = "set data.name_pattern (of forewarp-capture: name_pattern) to a regular expression with a group"
 KEY += " 'frame' or 'time', and 'camera' for a rig"
@@ -19,16 +20,23 @@ KEY += " 'frame' or 'time', and 'camera' for a rig"
 _NUMBER = r"((?<!\d)\d{9,10}\.\d+|(?<![^/])\d+\.(?:\d{6}|\d{9})(?=$|\.[A-Za-z])|\d+)"
 # Date and time of day, with or without thousandths of a second, as phones and screenshots name images.
 _DATED = re.compile(
-    r"(?<!\d)((?:19|20)\d\d)([-_.]?)(\d\d)\2(\d\d)[-_ T.]?(\d\d)([-_.:]?)(\d\d)\6(\d\d)(?:\.?(\d{3}))?(?!\d)"
+    r"(?<!\d)((?:19|20)\d\d)([-_.]?)(\d\d)\2(\d\d)(?: at |[-_ T.])?"
+    r"(?:(\d\d)(\d\d)(\d\d)|(\d\d?)([-_.:])(\d\d)(?:\9(\d\d))?)(?:\.?(\d{3}))?(?!\d)"
+    r"(?:\s?([AaPp])\.?[Mm]\b\.?)?"
 )
+_STOPWATCH = re.compile(r"(?<!\d)(\d\d?)h(\d\d)m(\d\d)s(\d{3})?(?!\d)")  # as media players write it
 _SECONDS_NANOSECONDS = re.compile(r"(?<!\d)(\d{9,10})[_-](\d{9})(?!\d)")
 _FRAME_WORD = re.compile(r"(?i)(?:^|[^a-z])(frame|time|t)[_-]?$")
-_CAMERA_WORD = re.compile(r"(?i)(?:^|[^a-z])(cam|camera|view|sensor|c|v)[_-]?$")
+_CAMERA_WORD = re.compile(r"(?i)(?:^|[^a-z])(cam|camera|view|sensor|c|v)[_( -]*$")
+_EXPONENT = re.compile(r"\d\.\d*[eE][-+]?\d")
+_CLOCK = re.compile(r"([01]\d|2[0-3])([0-5]\d)([0-5]\d)?")  # digits that may be a time of day
+_DAY = re.compile(r"(19|20)\d\d(0[1-9]|1[0-2])([0-2]\d|3[01])")
 _ODD = 0.2  # share of the names that may have another form than all others, and are then named in the error
 _SAME_FRAMES = 0.8  # share of all frame numbers that each camera must have where no word tells the camera
 _SPAN = 0.8  # share of the whole sequence that each camera's, or each split's, frame numbers must span
-_COUNTER_DIGITS = 4  # from which a counter may begin anew after its last number
+_COUNTER_DIGITS = 3  # from which a counter may begin anew after its last number
 _ONE_PATH, _JUMPS = 3.0, 8.0  # steps from camera to camera, in steps of one camera: at most, at least
+_STILL = 1e-3  # of all positions' extent: a camera that moves less stands
 _STEP = 0.3  # of all positions' extent: longer steps are no path's
 LEAST_SPAN, _MOST_FAR = 0.05, 0.1  # of all times: less is hardly what was meant; share that may be wrong
 
@@ -58,17 +66,28 @@ def name_parts(name: str) -> list[str | float]:
 
 def _split(name: str) -> list[str]:
     """Split a name into text, at even places, and digits; date and time of day are written as seconds."""
-    return re.split(_NUMBER, _SECONDS_NANOSECONDS.sub(r"\1.\2", _DATED.sub(_seconds, name)))
+    name = _STOPWATCH.sub(_milliseconds, _DATED.sub(_seconds, name))
+    return re.split(_NUMBER, _SECONDS_NANOSECONDS.sub(r"\1.\2", name))
 
 
-def _seconds(found: re.Match) -> str:
+def _seconds(match: re.Match) -> str:
     """Write date and time of day as seconds since 1970; other digits stay as they are."""
-    year, _, month, day, hour, _, minute, second, thousandths = found.groups()
+    year, _, month, day, *packed, hour, _, minute, second, thousandths, half = match.groups()
+    hour, minute, second = packed if packed[0] else (hour, minute, second)
+    if second is None and half is None:  # of two numbers after a date neither need be of a clock
+        return match[0]
+    hour = int(hour) if half is None else int(hour) % 12 + 12 * (half in "Pp")
     try:
-        date = datetime(*map(int, (year, month, day, hour, minute, second)), tzinfo=timezone.utc)
+        parts = (int(part) for part in (year, month, day, hour, minute, second or 0))
+        date = datetime(*parts, tzinfo=timezone.utc)
     except ValueError:
-        return found[0]
+        return match[0]
     return f"{int(date.timestamp())}.{thousandths or '000'}000"
+
+
+def _milliseconds(match: re.Match) -> str:
+    hours, minutes, seconds, thousandths = (int(part or 0) for part in match.groups())
+    return str(((hours * 60 + minutes) * 60 + seconds) * 1000 + thousandths)
 
 
 class NameNumbers(NamedTuple):
@@ -108,9 +127,17 @@ class _Reading:
         """Whether no camera has a frame number twice."""
         return sum(map(len, self.groups)) == len(self.frames)
 
-    def shared(self) -> float:
-        """Return the least share of all frame numbers that a camera has."""
-        return min(map(len, self.groups)) / len({*self.frames})
+    @property
+    def is_shared(self) -> bool:
+        """Whether several cameras have nearly the same frame numbers."""
+        share = min(map(len, self.groups)) / len({*self.frames})
+        return len(self.groups) > 1 and len({*self.frames}) < len(self.frames) and share >= _SAME_FRAMES
+
+    @property
+    def is_apart(self) -> bool:
+        """Whether one camera's frame numbers end before the next one's begin."""
+        ends = sorted((min(group), max(group)) for group in self.groups)
+        return all(high < low for (_, high), (low, _) in zip(ends, ends[1:]))
 
 
 def read_names(
@@ -135,36 +162,45 @@ def read_names(
         SceneError: for a pattern that is none, lacks a group or misses a name; and without a pattern for
             names of which one has another form, or that may be read in several ways, naming these.
 
-    Rules without a pattern: date and time of day, and ``seconds.fraction``, are one number. A number after
-    ``frame`` or ``time`` is the frame's, one after ``cam``, ``view`` or ``sensor`` the camera's. Of several
-    other numbers the last counts frames and the rest tell cameras if all cameras have nearly the same frame
-    numbers and their positions do not continue one path; all numbers together order one film if they do, or
-    if no frame number comes twice.
+    Rules without a pattern: date and time of day, and ``seconds.fraction``, are one number, and where they
+    vary they are the time. A number after ``frame`` or ``time`` is the frame's, one after ``cam``, ``view``
+    or ``sensor`` the camera's. Of several other numbers one counts frames and the rest tell cameras if all
+    cameras have nearly the same frame numbers and stand, or move in much shorter steps than the other way
+    round; all numbers together order one film if the positions continue one path, or if the last number
+    grows from part to part.
 
     >>> read_names(["a/0001", "a/0003", "b/0001", "b/0003"], "t.json").frames
     [1.0, 3.0, 1.0, 3.0]
     """
     if pattern is not None:
         return _by_pattern(names, where, pattern)
-    rows = _of_one_form(names, where)
+    rows = _of_one_form(names, where) if names else None
     if rows is None:
         return None
+    if any(map(_EXPONENT.search, names)):
+        raise _two_ways(where, names[0], "numbers with exponents")
     fractions = [i for i in range(3, len(rows[0]), 2) if _joined_fraction(rows, i)]
+    for i in range(1, len(rows[0]), 2):
+        _read_clock(rows, i, where)
     places = [i for i in range(1, len(rows[0]), 2) if len({float(row[i]) for row in rows}) > 1]
     places = [i for i in places if i not in fractions]
     if not places or all(_word(rows, i, _CAMERA_WORD) for i in places):
         return None
-    found = _chosen(rows, places, where, centers)
-    if found is None:
+    reading = _chosen(rows, places, where, centers)
+    if reading is None:
         return None
-    frames, told = _unrolled(rows, found)
+    frames, told = _unrolled(reading)
     refuse_far(dict(zip(names, frames)), where, "number", f"rename it, or {KEY}")
-    if len(found.groups) > 1:
-        _check_groups(found, names, where)
-        if len({*frames}) < len(frames):
-            told += "; images of one number share a time"
-    cameras = ["".join(camera) for camera in found.cameras] if len({*found.cameras}) > 1 else None
+    if len({*frames}) < len(frames):
+        _check_groups(reading, names, where)
+        told += "; images of one number share a time"
+    cameras = ["".join(camera) for camera in reading.cameras] if len({*reading.cameras}) > 1 else None
     return NameNumbers(frames, cameras, told)
+
+
+def _two_ways(where: str, name: str, readings: str) -> SceneError:
+    expected = "names that tell times in one way"
+    return mismatch(where, expected, f"names as '{name}': {readings}", f"write time in each frame, or {KEY}")
 
 
 def _by_pattern(names: Sequence[str], where: str, pattern: str) -> NameNumbers:
@@ -176,16 +212,19 @@ def _by_pattern(names: Sequence[str], where: str, pattern: str) -> NameNumbers:
     if len(groups) != 1:
         got = " and ".join(groups) or "neither"
         raise mismatch("data.name_pattern", "a group named time or frame, as (?P<frame>[0-9]+)", got)
-    found = [compiled.search(name) for name in names]
-    if None in found:
-        missed = names[found.index(None)]
+    matches, frames = [compiled.search(name) for name in names], []
+    if None in matches:
+        missed = names[matches.index(None)]
         raise mismatch("data.name_pattern", f"to be found in every name of {where}", f"not in '{missed}'")
-    try:
-        frames = [float(match[groups[0]]) for match in found]
-    except (TypeError, ValueError):
-        bad = next(match[groups[0]] for match in found if not re.fullmatch(r"[\d.]+", match[groups[0]] or ""))
-        raise mismatch(f"data.name_pattern: group {groups[0]}", "a number", f"'{bad}'") from None
-    cameras = [match["camera"] for match in found] if "camera" in compiled.groupindex else None
+    for name, match in zip(names, matches):
+        try:
+            frames.append(float(match[groups[0]]))
+        except (TypeError, ValueError):
+            frames.append(math.nan)
+        if not math.isfinite(frames[-1]):
+            got = f"'{match[groups[0]]}' of '{name}'"
+            raise mismatch(f"data.name_pattern: group {groups[0]}", "a number", got)
+    cameras = [match["camera"] for match in matches] if "camera" in compiled.groupindex else None
     reading = _Reading("", frames, [(camera,) for camera in cameras or [""] * len(names)])
     if not reading.is_unique:
         seen: set = set()
@@ -237,14 +276,41 @@ def _joined_fraction(rows: list[list[str]], place: int) -> bool:
     """
     if any(row[place - 1] != "." or "." in row[place - 2] + row[place] for row in rows):
         return False
-    widths = {len(row[place]) for row in rows}
-    if len(widths) > 1 or (width := widths.pop()) < 2 or _word(rows, place - 2, _CAMERA_WORD):
+    if _word(rows, place - 2, _CAMERA_WORD):
         return False
-    if max(int(row[place]) for row in rows) < 0.5 * 10**width:
-        return False
+    if not _word(rows, place - 2, _FRAME_WORD):
+        widths, most = {len(row[place]) for row in rows}, max(int(row[place]) for row in rows)
+        width = max(widths)
+        # Two digits up to 59 are minutes or seconds.
+        if len(widths) > 1 or width < 2 or most < 0.5 * 10**width or (width == 2 and most < 60):
+            return False
     for row in rows:
         row[place - 2] = f"{row[place - 2]}.{row[place]}"
     return True
+
+
+def _read_clock(rows: list[list[str]], place: int, where: str) -> None:
+    """Turn digits that are a time of day in all names, ``103059`` or behind a date ``1030``, into seconds.
+
+    A counter that is none of these has a number whose last two digits are above 59.
+
+    Raises:
+        SceneError: for times more than half a day apart, whose film may have gone on after midnight.
+    """
+    digits = [row[place] for row in rows]
+    behind_a_day = place > 1 and all(
+        row[place - 1] in "-_" and _DAY.fullmatch(row[place - 2]) for row in rows
+    )
+    matches = [_CLOCK.fullmatch(text) for text in digits]
+    if None in matches or len({*digits}) < 2 or not (behind_a_day or all(match[3] for match in matches)):
+        return
+    if int(max(digits)) < (100 if len(digits[0]) == 4 else 10000):
+        return
+    seconds = [sum(f * int(part or 0) for f, part in zip((3600, 60, 1), match.groups())) for match in matches]
+    if max(seconds) - min(seconds) > 12 * 3600:
+        raise _two_ways(where, "".join(rows[0]), "times of day more than half a day apart")
+    for row, second in zip(rows, seconds):
+        row[place] = str(second)
 
 
 def _chosen(
@@ -256,34 +322,65 @@ def _chosen(
         SceneError: naming the readings where two do.
     """
     texts = [i for i in range(0, len(rows[0]), 2) if len({row[i] for row in rows}) > 1]
-
-    def of_place(place: int, what: str) -> _Reading:
-        others = sorted([*texts, *(i for i in places if i != place)])
-        cameras = [tuple(row[i] for i in others) for row in rows]
-        return _Reading(what, [float(row[place]) for row in rows], cameras)
-
     named = [i for i in places if _word(rows, i, _FRAME_WORD)]
     for_cameras = [i for i in places if _word(rows, i, _CAMERA_WORD)]
     free = [i for i in places if i not in for_cameras]
+    numbers = "taken from the numbers in the images' names"
+
+    def of_place(place: int, others: Sequence[int], what: str = numbers) -> _Reading:
+        cameras = [tuple(row[i] for i in sorted({*texts, *others} - {place})) for row in rows]
+        return _Reading(what, [float(row[place]) for row in rows], cameras)
+
+    clocks = [i for i in free if all(_is_stamp(row[i]) for row in rows)]
+    if clocks and not named:  # counters beside a clock say nothing more
+        # Of whole seconds the number beside may count the images of each.
+        is_fine = any(row[clocks[-1]].isdigit() or float(row[clocks[-1]]) % 1 for row in rows)
+        readings = [of_place(clocks[-1], others) for others in (for_cameras, places)[: 1 + is_fine]]
+        if unique := [reading for reading in readings if reading.is_unique]:
+            return unique[0]
+    together, parts = "all numbers together order one film", of_place(free[-1], for_cameras).cameras
+    film = _Reading(together, _ranked(rows, free), parts)
     if named or len(free) == 1:
-        reading = of_place((named or free)[-1], "taken from the numbers in the images' names")
-        return reading if reading.is_unique else None
-    rig = of_place(free[-1], "the last number counts frames, the others tell cameras")
-    cameras = [tuple(row[i] for i in (*texts, *for_cameras)) for row in rows]
-    film = _Reading("all numbers together order one film", _ranked(rows, free), cameras)
-    path = None if centers is None else _path(rig, film, centers)
-    are_apart = sum(map(len, rig.groups)) == len({*rig.frames})
-    is_rig = rig.is_unique and rig.shared() >= _SAME_FRAMES and not are_apart
-    in_folder = len(free) == 2 and all("/" in "".join(row[free[0] + 1 : free[1]]) for row in rows)
-    if path is None and (are_apart or (is_rig and in_folder)):  # most rigs have a folder for each camera
-        path = "film" if are_apart else "rig"
-    if path == "rig" and is_rig:
-        return rig
-    if path == "film" and film.is_unique:
+        reading = of_place((named or free)[-1], places)
+        if not reading.is_unique:
+            return None
+        film = _Reading(together, _ranked(rows, places), [()] * len(rows))
+        is_shared = len({*reading.frames}) < len(rows) and film.is_unique
+        if is_shared and centers is not None and _path(reading, film, centers) == "film":
+            raise _two_ways(where, "".join(rows[0]), "words tell cameras, whose positions continue one path")
+        return reading
+    count = "number {} of each name counts frames, the others tell cameras"
+    rigs = [of_place(place, places, count.format(n)) for n, place in enumerate(free, 1)]
+    rigs = [rig for rig in rigs if rig.is_unique and rig.is_shared]
+    last = of_place(free[-1], places)
+    path = None if centers is None else _path(last, film, centers)
+    if centers is not None and rigs and path != "film":
+        steps = [_step(rig, centers) for rig in rigs]
+        short = min(steps)
+        near = [rig for rig, step in zip(rigs, steps) if step <= _ONE_PATH * short]
+        if len(near) == 1 and (len(rigs) > 1 or path == "rig" or short == 0):
+            return near[0]
+    are_parts = film.is_unique and last.is_apart
+    if film.is_unique and (path == "film" or (path is None and are_parts and not rigs)):
         return film
-    readings = f"{rig.what} ({len({*rig.frames})} times), or {film.what} ({len({*film.frames})} times)"
-    expected, got = "names that tell times in one way", f"names as '{''.join(rows[0])}': {readings}"
-    raise mismatch(where, expected, got, f"write time in each frame, or {KEY}")
+    readings = [f"{one.what} ({len({*one.frames})} times)" for one in (*rigs, film)]
+    raise _two_ways(where, "".join(rows[0]), ", or ".join(readings))
+
+
+def _is_stamp(digits: str) -> bool:
+    """Tell whether digits are a date, or a clock's seconds, thousandths or less since some time long ago."""
+    whole, point, _ = digits.partition(".")
+    return len(whole) >= (9 if point else 13)
+
+
+def _step(rig: _Reading, centers: Sequence[Sequence[float]]) -> float:
+    """Return the median way of a camera of a rig from frame to frame; 0 where cameras stand."""
+    places = np.asarray(centers, np.float64)
+    order = sorted(range(len(places)), key=lambda i: (rig.cameras[i], rig.frames[i]))
+    steps = np.linalg.norm(np.diff(places[order], axis=0), axis=-1)
+    within = [step for a, b, step in zip(order, order[1:], steps) if rig.cameras[a] == rig.cameras[b]]
+    middle = median(within) if within else math.inf
+    return 0.0 if middle <= _STILL * float(np.ptp(places, axis=0).max()) else middle
 
 
 def _ranked(rows: Sequence[Sequence[str]], places: Sequence[int]) -> list[float]:
@@ -320,7 +417,7 @@ def _path(rig: _Reading, film: _Reading, centers: Sequence[Sequence[float]]) -> 
     return "film" if ratio <= _ONE_PATH else "rig" if ratio >= _JUMPS else None
 
 
-def _unrolled(rows: Sequence[Sequence[str]], reading: _Reading) -> tuple[list[float], str]:
+def _unrolled(reading: _Reading) -> tuple[list[float], str]:
     """Continue a counter that began anew after its last number, as 9999; also say what was read."""
     frames, told = reading.frames, f"{reading.what}, {min(reading.frames):.10g} to {max(reading.frames):.10g}"
     highest, lowest = max(frames), min(frames)
@@ -359,6 +456,9 @@ def _check_groups(reading: _Reading, names: Sequence[str], where: str) -> None:
     counted = [sum(number in group for group in groups) for number in everything]
     if max(counted) == 1:  # no number twice: one numbering of all
         return
+    letters = [tuple(re.sub("[^a-z0-9/]", "", part.lower()) for part in camera) for camera in reading.cameras]
+    if len(groups) > len(names) / 2 or not replace(reading, cameras=letters).is_unique:
+        raise _two_ways(where, names[0], "what is beside the numbers differs from image to image")
     for group, camera in zip(groups, dict.fromkeys(reading.cameras)):
         if len(group) > 1 and max(group) - min(group) < _SPAN * whole:
             name = names[reading.cameras.index(camera)]
