@@ -1,6 +1,8 @@
 """What jobs will take, from measured ones: numbers worked out by hand."""
 
 import json
+import time
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
@@ -51,7 +53,17 @@ def test_steps_are_multiplied_and_the_first_bound_ends_training():
 
 def test_views_are_scaled_by_their_pixels():
     few = replace(LIKE, views=5.0, pixels=40_000.0)
-    assert cost_of(job(1.0, like=few), [MEASURED], []).wall == pytest.approx(60 + 10 + 5 * 0.5 / 4)
+    assert cost_of(job(1.0, like=few), [MEASURED], []).wall == pytest.approx(60 + 10 + 5 * (0.1 / 4 + 0.4))
+
+
+def test_a_small_run_tells_little_of_large_views():
+    tiny = replace(MEASURED, scene="ball", views=3.0, pixels=1024.0, frame=0.001, scoring=0.1, rest=30.0)
+    # 0.001 s become 0.156 s by the pixels; scoring and what a run takes once are not multiplied by them.
+    frame = 0.001 * 160_000 / 1024
+    assert cost_of(job(1.0), [tiny], []).wall == pytest.approx(60 + 30 + 20 * (frame + 0.1))
+    others = [replace(MEASURED, scene="lego"), *[tiny] * 3]
+    found = cost_of(job(1.0, like=replace(LIKE, scene="new")), [*others, *[others[0]] * 2], [])
+    assert found.wall == pytest.approx(60 + 10 + 20 * 0.5)  # of those with as many pixels
 
 
 def test_processor_minutes_of_two_threads_are_half_as_many_of_the_wall_clock():
@@ -116,11 +128,24 @@ def test_rows_are_kept_and_read_and_a_broken_file_is_none(tmp_path, monkeypatch)
     add_cost(MEASURED)
     add_cost(replace(MEASURED, frame=None))
     assert read_costs(own_file()) == [MEASURED, replace(MEASURED, frame=None)]
+    first, second, third = own_file().read_text().splitlines()
+    own_file().write_text("\n".join([first, second.replace("1000", "many"), third, ""]))
+    add_cost(LIKE)
+    assert read_costs(own_file()) == [replace(MEASURED, frame=None), LIKE]  # less the broken row alone
     monkeypatch.setattr(cost, "_KEPT", 1)
     add_cost(LIKE)
     assert read_costs(own_file()) == [LIKE]
     own_file().write_text("something,else\n1,2\n")
     assert read_costs(own_file()) == []
+
+
+def test_jobs_that_end_at_once_lose_no_row(tmp_path, monkeypatch):
+    monkeypatch.setenv(cost.FILE_VARIABLE, str(tmp_path / "times.csv"))
+    read = cost.read_costs
+    monkeypatch.setattr(cost, "read_costs", lambda file: (read(file), time.sleep(0.02))[0])
+    with ThreadPoolExecutor(4) as pool:
+        list(pool.map(add_cost, [LIKE] * 4))
+    assert len(read(own_file())) == 4
 
 
 def test_a_job_is_measured_by_the_clock_that_went_less(tmp_path, monkeypatch):
@@ -130,12 +155,13 @@ def test_a_job_is_measured_by_the_clock_that_went_less(tmp_path, monkeypatch):
         done = {"steps": 100, "clocks": {"wall": wall, "processor": 10.0}, "peak_memory_bytes": 2**30}
         (tmp_path / name / "done.json").write_text(json.dumps(done))
     (tmp_path / "metrics.json").write_text(json.dumps({"seconds": {"render_per_frame": 0.5}}))
-    (tmp_path / "per_image.json").write_text(json.dumps({"images": [{}] * 4}))
+    images = [{"seconds_scored": seconds} for seconds in (2.5, 0.25, 0.25, 0.25)]
+    (tmp_path / "per_image.json").write_text(json.dumps({"images": images}))
     moments = [{"wall": wall, "processor": of} for wall, of in ((100, 50), (140, 78), (148, 84))]
     row = measured_cost(OmegaConf.create(), tmp_path, moments, pixels=400)
-    # 28 s of the processor less 20 of training; 6 s for 4 views of which each is rendered in half a second.
-    assert (row.steps, row.seconds, row.processor, row.rest) == (200, 20, 20, 8)
-    assert (row.views, row.pixels, row.frame, row.scoring, row.memory) == (4, 400, 0.5, 1.0, 1.0)
+    # 28 s of the processor less 20 of training; of 6 s of measuring 4 x (0.5 + 0.25) are of views.
+    assert (row.steps, row.seconds, row.processor, row.rest) == (200, 20, 20, 8 + 3)
+    assert (row.views, row.pixels, row.frame, row.scoring, row.memory) == (4, 400, 0.5, 0.25, 1.0)
     assert row.disk == sum(file.stat().st_size for file in tmp_path.rglob("*.json"))
 
 

@@ -134,7 +134,9 @@ def evaluate(
             options = view.target.view.shape, reduce, view.target.background, scene.has_alpha
             small = {name: reduced_rendering(whole, *options) for name, whole in view.renderings.items()}
             view = replace(view, renderings=small)
+        begin = now()
         rows[view.number] = _score(view, suite)
+        rows[view.number]["seconds_scored"] = now() - begin
         _save(view, images, view.number in on_sheets)
         if progress is not None:
             progress(len(rows), len(chosen))

@@ -22,6 +22,7 @@ from pathlib import Path
 from statistics import median
 from time import perf_counter, process_time
 
+from filelock import FileLock
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
@@ -50,8 +51,8 @@ class Row:
         steps, seconds, processor: optimiser steps; seconds of training, as if nothing else ran, and of all
             threads together.
         views, pixels: test views that were measured, and pixels of one.
-        frame, scoring: seconds to render a view; the rest of measuring it.
-        rest: seconds of all else: reading, compiling, curves, checkpoints.
+        frame, scoring: seconds to render a view, and to score it.
+        rest: seconds of all else: reading, compiling, curves, checkpoints, what is measured of a whole run.
         memory, disk: GiB at the peak; bytes of the run's folder.
     """
 
@@ -129,10 +130,12 @@ def own_file() -> Path:
 
 
 def read_costs(file: Path) -> list[Row]:
-    """Read rows of jobs; none of a file that is missing or something else."""
-    found = []
-    with suppress(OSError, ValueError, KeyError, TypeError):
-        for row in read_rows(file):
+    """Read rows of jobs, but for broken ones; none of a file that is missing or something else."""
+    rows, found = [], []
+    with suppress(OSError, ValueError):
+        rows = read_rows(file)
+    for row in rows:
+        with suppress(ValueError, KeyError, TypeError):
             numbers = {name: float(row[name]) if row[name] else None for name in NAMES if name not in _TEXTS}
             found.append(Row(**{name: row[name] for name in _TEXTS}, **numbers))
     return found
@@ -143,7 +146,8 @@ def add_cost(row: Row) -> None:
     with suppress(OSError):
         file = own_file()
         file.parent.mkdir(parents=True, exist_ok=True)
-        write_costs(file, [*read_costs(file), row][-_KEPT:])
+        with FileLock(f"{file}.lock", timeout=10):  # of jobs that end at the same time
+            write_costs(file, [*read_costs(file), row][-_KEPT:])
 
 
 def write_costs(file: Path, rows: Iterable[Row]) -> None:
@@ -232,17 +236,21 @@ def measured_cost(
     began, fitted, ended = moments
     measuring = min(ended[kind] - fitted[kind] for kind in began)
     rest = min(fitted[kind] - began[kind] - trained[kind] for kind in began)
-    views = len((read_json(folder / "per_image.json") or {}).get("images", []))
+    images = (read_json(folder / "per_image.json") or {}).get("images", [])
+    views, scoring = len(images), _median(image.get("seconds_scored") for image in images)  # the first loads
     frame = ((read_json(folder / "metrics.json") or {}).get("seconds") or {}).get("render_per_frame")
     memory = max((float(done["peak_memory_bytes"]) for done in stages), default=0.0) / 2**30
     found = {"steps": float(sum(done["steps"] for done in stages)), "seconds": min(trained.values())}
-    found |= {"processor": trained["processor"], "rest": max(0.0, rest)}
+    found |= {"processor": trained["processor"]}
     found |= {"memory": memory, "day": date.today().isoformat()}
     found |= {"disk": float(sum(file.stat().st_size for file in folder.rglob("*") if file.is_file()))}
     if views and frame is not None:
         frame = min(frame, measuring / views)
+        scoring = min(scoring or 0.0, measuring / views - frame)
         found |= {"views": float(views), "pixels": pixels and float(pixels), "frame": frame}
-        found |= {"scoring": measuring / views - frame}
+        found |= {"scoring": scoring}
+        measuring -= views * (frame + scoring)
+    found |= {"rest": max(0.0, rest) + max(0.0, measuring)}
     return Row(**{**vars(likeness(config)), **found})
 
 
@@ -250,7 +258,7 @@ def cost_of(job: Job, own: Sequence[Row], prices: Sequence[Row]) -> Cost:
     """Estimate what a job will take.
 
     Rows of this machine are taken where there are any of the job's model and preset, else those of the price
-    list; of these the median of the three most alike: in their numbers, the scene, threads and length.
+    list; of these the median of the three most alike: in their numbers, scene, threads, pixels and length.
     """
     device = job.like.device
     own = [row for row in own if row.device == device]
@@ -284,8 +292,7 @@ def _cost_by(job: Job, alike: Sequence[Row], others: Sequence[Row], source: str)
         unknown.append("reading and compiling")
     measuring = 0.0
     if job.evaluate:
-        frame, scoring = (_per_view(job, alike, name) for name in ("frame", "scoring"))
-        scoring = _per_view(job, others, "scoring") if scoring is None else scoring
+        frame, scoring = _frame(job, alike), _first(alike, others, "scoring")
         if job.like.views is None:
             unknown.append(f"the test views of {job.like.scene}")
         elif frame is None:
@@ -306,9 +313,12 @@ def _distance(job: Job, row: Row) -> tuple:
     like = job.like
     length = 60 * job.minutes if job.minutes else job.iterations
     of_row = row.seconds if job.minutes else row.steps
-    apart = abs(math.log(length / of_row)) if length and of_row else math.inf
+
+    def apart(ours: float | None, theirs: float | None) -> float:
+        return round(abs(math.log(ours / theirs)), 1) if ours and theirs else math.inf
+
     differs = [getattr(like, name) != getattr(row, name) for name in ("numbers", "scene", "threads")]
-    return (*differs, round(apart, 1))
+    return (*differs, apart(like.pixels, row.pixels), apart(length, of_row))
 
 
 def _is_gpu(device: str) -> bool:
@@ -326,12 +336,12 @@ def _first(alike: Sequence[Row], others: Sequence[Row], name: str) -> float | No
     return known if known is not None else _median(getattr(row, name) for row in others)
 
 
-def _per_view(job: Job, rows: Sequence[Row], name: str) -> float | None:
-    """Return seconds of a view; they grow with its pixels, where these are known."""
+def _frame(job: Job, rows: Sequence[Row]) -> float | None:
+    """Return seconds to render a view; they grow with its pixels, where these are known."""
 
     def scaled(row: Row) -> float | None:
-        seconds, pixels = getattr(row, name), job.like.pixels
-        return seconds * pixels / row.pixels if seconds is not None and pixels and row.pixels else seconds
+        known = row.frame is not None and job.like.pixels and row.pixels
+        return row.frame * job.like.pixels / row.pixels if known else row.frame
 
     return _median(map(scaled, rows))
 

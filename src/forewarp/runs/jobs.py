@@ -39,9 +39,8 @@ class TellCost(Callback):
         except Exception as error:
             failed = error
             if not config.plan_only:
-                print(
-                    f"no estimate: {' '.join(str(error).split()) or type(error).__name__}"[:200], flush=True
-                )
+                said = " ".join(str(error).split()) or type(error).__name__
+                print(f"no estimate: {said}"[:200], flush=True)
         if config.plan_only:
             raise PlanOnly(failed)
 
