@@ -3,6 +3,7 @@ import errno
 import logging
 import os
 import platform
+import shlex
 import shutil
 from importlib.metadata import version
 from pathlib import Path
@@ -18,6 +19,7 @@ from omegaconf import OmegaConf
 from forewarp.cli import entry
 from forewarp.cli.mistakes import one_line, unknown_key, with_run_key
 from forewarp.data.files import SceneError
+from forewarp.runs.session import claim
 from tests.support.configs import CONF, ROOT, options
 
 TEXTS = {path.stem: path.read_text() for path in sorted(Path(entry.__file__).parent.glob("*.py"))}
@@ -288,3 +290,27 @@ def test_freed_memory_stays_where_the_c_library_can_be_told(monkeypatch):
     assert len(asked) == 2
     if platform.libc_ver()[0] == "glibc":
         assert [entry.ctypes.CDLL(None).mallopt(*given) for given in asked] == [1, 1]
+
+
+@pytest.mark.slow
+def test_a_pattern_of_names_is_taken_as_typed_also_of_a_sweep_and_as_stored(ok, in_tmp, monkeypatch):
+    seen, pattern = [], r"(?P<camera>\d+)_(?P<frame>\d+)"
+
+    def job(config):
+        seen.append((config.seed, config.data.name_pattern))
+        claim(config)
+
+    monkeypatch.setattr("forewarp.cli.train.train", job)
+    typed = ["data=dnerf", "data.scene=x", "run=a/${seed}", f"data.name_pattern={pattern}"]
+    ok("train", "--multirun", "seeds=2", *typed)
+    assert seen == [(0, pattern), (1, pattern)]
+    stored = shlex.split(OmegaConf.load("a/1/config.yaml").command)
+    ok("train", *stored[1:])
+    assert seen[2:] == [(1, pattern)]
+
+
+def test_a_pattern_of_names_is_taken_as_typed(ok, in_tmp, monkeypatch):
+    seen = []
+    monkeypatch.setattr("forewarp.cli.capture.capture", lambda config: seen.append(config.name_pattern))
+    ok("capture", "images=x", "name_pattern=(?P<frame>[0-9]+)$")
+    assert seen == ["(?P<frame>[0-9]+)$"]

@@ -188,3 +188,21 @@ def test_a_target_makes_another_run_and_none_is_as_before():
     config = config_of()
     before = OmegaConf.masked_copy(config, [key for key in config if key != "target"])
     assert content_hash(before) == content_hash(config) != content_hash(config_of("target.psnr=30"))
+
+
+def test_a_key_of_the_data_that_is_new_and_null_changes_no_hash():
+    """Finished jobs are found again by the digits that they were named by before the key was there."""
+    before = {
+        "data": {"root": "/scenes", "scene": "x", "box": None, "canonical": None},
+        "model": {"name": "nerf"},
+    }
+    before |= {"stage": {}, "preset": {"name": "fast"}, "budget": {"minutes": None}, "seed": 0, "trainer": {}}
+    now = before | {"data": before["data"] | {"name_pattern": None}}
+    another = before | {"data": before["data"] | {"name_pattern": r"(?P<frame>\d+)"}}
+    digits = [content_hash(OmegaConf.create(config)) for config in (before, now, another)]
+    assert digits[0] == digits[1] == "0d348e6b6c" != digits[2]
+    config = config_of("data=dnerf")
+    assert "name_pattern" in config.data
+    stored = OmegaConf.create(plain(config))
+    del stored.data["name_pattern"]
+    assert content_hash(stored) == content_hash(config)

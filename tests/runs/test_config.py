@@ -157,6 +157,17 @@ def test_odd_names_are_taken_as_typed():
     assert (config.data.scene, config.run) == ("[a", "runs/a'b")
 
 
+PATTERNS = [r"(?P<camera>\d+)_(?P<frame>\d+)", "(?P<frame>[0-9]+)$", r"^(a,b|\(c\))=(?P<time>[\d.]+)", "a,b"]
+
+
+@pytest.mark.parametrize("pattern", PATTERNS)
+def test_a_pattern_of_names_is_one_text(pattern):
+    for key in ("name_pattern", "data.name_pattern"):
+        (word,) = as_text([f"{key}={pattern}"])
+        assert as_text(["--multirun", word, f"{key}={pattern}"])[1:] == [word, word]
+        assert typed(word).value() == pattern
+
+
 def test_a_list_null_and_an_interpolation_stay_hydras_and_home_is_found(monkeypatch):
     monkeypatch.setenv("HOME", "/home/me")
     assert as_text(["runs=[a,b]", "run=null", "run=${paths.runs}/x", "out=~/x", "data.scene=~/x"]) == [

@@ -33,6 +33,7 @@ IDENTITY = ("data", "model", "objective", "stage", "preset", "budget", "seed")
 # Keys that tell runs apart where they are set; configs of before lack them.
 IDENTITY_IF_SET = ("start", "target")
 NOT_OF_RUN = ("cache_bytes", "disk_cache_bytes")  # keys of the data that change no frame
+DATA_IF_SET = ("name_pattern",)  # keys of the data that count where they are set; configs of before lack them
 HASH = "{hash}"
 # May be set beside resume=<run>.
 MAY_CHANGE = "trainer", "threads", "lpips_weights", "sheets", "views", "reduce", "evaluate", "logger"
@@ -143,8 +144,9 @@ def content_hash(config: DictConfig, more: Sequence[str] = (), *others: object) 
     make_absolute(config)
     content = {key: plain(config.get(key)) for key in (*IDENTITY, *more)}
     content |= {key: value for key in IDENTITY_IF_SET if (value := set_value(config, key)) is not None}
-    for key in NOT_OF_RUN if isinstance(content["data"], dict) else ():
-        content["data"].pop(key, None)
+    if isinstance(data := content["data"], dict):
+        absent = {key for key in DATA_IF_SET if data.get(key) is None}
+        content["data"] = {key: value for key, value in data.items() if key not in {*NOT_OF_RUN, *absent}}
     precision = config.trainer.get("precision")
     if config.budget.minutes is not None:
         from forewarp.runs.build import device_for  # loads torch

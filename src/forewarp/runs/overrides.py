@@ -8,10 +8,12 @@ import shlex
 from collections.abc import Sequence
 from contextlib import suppress
 
-# Keys that hold a path, or the name of a scene's folder; those in which a list of paths may stand.
+# Keys that hold a path, the name of a scene's folder, or a regular expression, which is always one value;
+# those in which a list of paths may stand.
+PATTERN = re.compile(r"(data\.)?name_pattern")
 TEXTS = re.compile(
     r"data\.(root|scene)|paths\.\w+|plan\.folder|run2?|runs|resume|start|out|videos?|images|colmap|masks|curves|"
-    "published|lpips_weights|rows|columns|metric"
+    f"published|lpips_weights|rows|columns|metric|{PATTERN.pattern}"
 )
 LISTS = ("runs", "published", "lpips_weights", "rows", "columns", "metric")
 constant: set[str] = set()  # keys that were typed with one value, which tell no jobs of a sweep apart
@@ -71,7 +73,7 @@ def bare(override: str) -> str:
 
 
 def as_text(arguments: Sequence[str]) -> list[str]:
-    """Quote paths and names of scenes so that Hydra keeps them as they were typed: ``2024``, ``VID (1).mp4``.
+    r"""Quote paths, names of scenes and patterns so that Hydra keeps them as they are typed: ``VID (1).mp4``.
 
     What is typed in quotes, an interpolation, null where a key may be null, and a list of paths where there
     may be several are left as they are; a leading ``~/`` is the home folder.
@@ -80,13 +82,16 @@ def as_text(arguments: Sequence[str]) -> list[str]:
     ["data.root='/data/josé'", "data.scene='hand (1)'", 'out=null', "run='a b'", 'seed=1']
     >>> as_text(["data.scene=null", "data.scene={a}", "run=[a]", "runs=[a]"])
     ["data.scene='null'", "data.scene='{a}'", "run='[a]'", 'runs=[a]']
+    >>> as_text([r"data.name_pattern=(?P<frame>\d+)", "name_pattern=_(?P<frame>[0-9]+)$"])
+    ["data.name_pattern='(?P<frame>\\d+)'", "name_pattern='_(?P<frame>[0-9]+)$'"]
     """
     swept, found = bool({"-m", "--multirun"} & set(arguments)), []
     for argument in arguments:
         key, _, value = argument.partition("=")
         name = key_of(argument)
         typed = TEXTS.fullmatch(name) and value and not _is_of_hydra(name, value)
-        several = typed and (swept or name == "data.scene") and is_sweep(argument)
+        is_pattern = PATTERN.fullmatch(name)
+        several = typed and not is_pattern and (swept or name == "data.scene") and is_sweep(argument)
         if typed and name != "data.scene" and value.startswith("~/"):
             value = os.path.expanduser(value)
         found.append(text_override(key, value) if typed and not several else argument)
