@@ -17,6 +17,7 @@ from forewarp.report.paper import (
     COSTS,
     PAPER,
     comparison,
+    incomplete,
     measured,
     read_paper,
     stand_in,
@@ -91,7 +92,11 @@ def test_seeds_give_an_interval_where_all_scenes_have_them(tmp_path):
             paper_run(tmp_path, scene, seed=seed, psnr=psnr)
     paper_run(tmp_path, "hook", seed=3, psnr=99.0)
     table = table_of(tmp_path)
-    assert cells(table, f"{OURS}, 4 seeds")[0] == "21.00 ± 2.48"  # 4.303 / sqrt(3)
+    assert cells(table, f"{OURS}, 4 seeds")[0] == "21.00 ± 2.48 [3 of 4 seeds]"  # 4.303 / sqrt(3)
+    runs, others = read_runs(tmp_path)[0], ", ".join(ALL[:2] + ALL[3:])
+    told = f"Table 1, Mean of 8, {OURS}, 4 seeds: seed 3 has no {others}"
+    assert incomplete(read_paper(PAPER)["dnerf"], runs) == [told]
+    assert f"\n* {told}" in write_paper(tmp_path, tmp_path / "out")[0].read_text()
     assert "95 % confidence interval of a mean (Student's t over the seeds)" in table.caption
 
 
@@ -489,6 +494,26 @@ def test_a_row_with_fewer_seeds_says_so(tmp_path):
     assert rows_of(rows, "w/o coarse stage")[0][3:5] == ["-1.00 ± 0.00", "holds (3 of 4 seeds)"]
     # 0.0, 0.1, 0.2 and 0.3: a deviation of 0.129, 3.182 of its halves.
     assert rows_of(rows, "w/o flow L1")[0][3:5] == ["+0.15 ± 0.21", "no difference shown"]
+
+
+def test_scores_of_unknown_seeds_are_not_paired(tmp_path):
+    for seed in range(3):
+        for variant, change in (("full", 0.0), ("no_tv", -1.0)):
+            psnr = {"time": 25.0 + seed + change, "space": 26.0 + seed + change}
+            part(tmp_path, variant, seed, psnr, scene="lift", dataset="lego_complete")
+    _, table = write_ablation(tmp_path, tmp_path / "out")
+    lines = table.read_text().splitlines()
+    marked = [lines[0] + ",unpaired", *(f"{line},space; late" for line in lines[1:])]
+    table.write_text("\n".join(marked))
+    for _ in range(2):  # the second time from what the first wrote
+        text = write_ablation(table, tmp_path / "out")[0].read_text()
+        sections = {part.partition("\n")[0]: part for part in text.split("\n## ")}
+        rows = {name: rows_of(part, "Ours, no total variation (80^3)") for name, part in sections.items()}
+        ((space,),) = (found for name, found in rows.items() if found and ": Space" in name)
+        ((time,),) = (found for name, found in rows.items() if found and ": Time" in name)
+        assert space[2:5] == ["26.00 ± 2.48", "", ""]
+        assert time[2:5] == ["25.00 ± 2.48", "-1.00 ± 0.00", "holds"]
+        assert text.count("Which seed has which score was not kept") == 1
 
 
 def test_kinds_of_test_views_and_scenes_have_sections_of_their_own(tmp_path):

@@ -5,6 +5,8 @@ from functools import partial
 import pytest
 import yaml
 
+from forewarp.metrics import registry
+from forewarp.metrics.registry import Metric, metric_of
 from forewarp.report import figures
 from forewarp.report.benchmark import write_methods, write_minutes
 from forewarp.report.choices import write_effects, write_price_list
@@ -87,3 +89,24 @@ def test_a_table_of_something_else_is_refused_in_one_line(tmp_path):
     for name in ("other.csv", "none.csv"):
         with pytest.raises(ValueError, match=f"runs: expected a CSV file of a page, .* but got .*{name}"):
             write_effects(tmp_path / name, tmp_path)
+
+
+@pytest.mark.parametrize("table", ["price-list.csv", "forward.csv", "methods.csv"])
+def test_a_table_keeps_which_way_a_metric_of_another_package_is_better(tmp_path, monkeypatch, table):
+    about = {"title": "Blur", "digits": 1, "higher_is_better": False, "unit": "px", "summary": True}
+    made = tmp_path / "made"
+    made.mkdir()
+    for seed in range(3):
+        for variant, value in (("base", 3.0), ("unet_16", 2.0)):
+            config = {} if table == "price-list.csv" else {"variant": None, "model": {"name": "forward"}}
+            test = {"all": {"psnr": 30.0, "own_blur": value}}
+            more = {"test": test, "metrics": {"own_blur": about}, "protocol": TOY}
+            write_run(tmp_path / "runs", variant, seed, config=config, metrics=more)
+    write = {"price-list.csv": write_price_list, "forward.csv": write_minutes, "methods.csv": write_methods}[
+        table
+    ]
+    write(tmp_path / "runs", made)
+    monkeypatch.setattr(registry, "_STORED", {})  # as where the table is read later
+    write(made / table, made)
+    assert metric_of("own_blur") == Metric("own_blur", **about)
+    assert "Blur" in (made / table).with_suffix(".md").read_text()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import math
 from collections.abc import Callable, Iterable, Mapping
@@ -165,6 +166,14 @@ def described(names: Iterable[str]) -> dict[str, dict]:
     {'ssim': {'title': 'SSIM', 'digits': 4, 'higher_is_better': True, 'unit': '', 'summary': True}}
     """
     return {name: {key: getattr(METRICS[name], key) for key in _DESCRIBED} for name in names}
+
+
+def described_own(names: Iterable[str]) -> str:
+    """Describe the metrics of other packages as JSON, for a column of a CSV file; "" if there are none."""
+    listed = {"lpips", *(metric.name for metric in _LISTED)}
+    own = {name: metric_of(name) for name in names if name not in listed}
+    about = {name: {key: getattr(metric, key) for key in _DESCRIBED} for name, metric in own.items()}
+    return json.dumps(about) if about else ""
 
 
 def take_described(content: object) -> None:

@@ -23,8 +23,8 @@ from forewarp.metrics.registry import metric_of
 from forewarp.report import figures, motion_figures
 from forewarp.report.results import KINDS, Point, Row, Runs, nothing, refused
 from forewarp.report.settings import grouped
-from forewarp.report.statistics import INTERVALS, LEAST, Estimate, by_chance, rank, verdict
-from forewarp.report.stored import read_any, stored_csv
+from forewarp.report.statistics import INTERVALS, LEAST, Estimate, by_chance, paired_change, rank, verdict
+from forewarp.report.stored import UNPAIRED, read_any, stored_csv
 from forewarp.report.tables import Cell, Column, Difference, Section, Table, rendered
 
 PAPER = Path(__file__).with_name("paper.yaml")  # the printed numbers
@@ -184,7 +184,25 @@ def by_seed(runs: Runs, group: Group, metric: str) -> dict[int, float]:
 
 def cells_of(runs: Runs, table: PaperTable) -> list[Estimate | None]:
     """Estimate every column's mean over the seeds of ``by_seed``; None where these are none."""
-    return [Estimate.of(by_seed(runs, *column).values()) for column in table.columns]
+    cells = []
+    for group, metric in table.columns:
+        asked = len(runs.where(origin=group.dataset, scene=group.scenes).by("seed"))
+        cell = Estimate.of(by_seed(runs, group, metric).values())
+        cells.append(cell and replace(cell, asked=asked))
+    return cells
+
+
+def incomplete(table: PaperTable, runs: Runs) -> list[str]:
+    """List the seeds that a mean over scenes leaves out, as they lack some of these."""
+    lines, found = {}, measured(table, runs)
+    for of_row, group in product(found, table.groups):
+        of_seed = of_row.where(origin=group.dataset, scene=group.scenes).by("seed")
+        absent = {seed: [s for s in group.scenes if not own.where(scene=s)] for seed, own in of_seed.items()}
+        if len(set(map(tuple, absent.values()))) > 1:  # else no seed has these scenes
+            for seed, scenes in absent.items():
+                about = f"{table.title.partition(':')[0]}, {group.name}, {name_of(of_row, found)}"
+                lines |= {f"{about}: seed {seed} has no {', '.join(scenes)}": None} if scenes else {}
+    return [*lines]
 
 
 def numbered(runs: Iterable[Row]) -> dict[str, int]:
@@ -384,6 +402,7 @@ def write_paper(
         name = "-".join(re.findall(r"\w+", table.title.split(",")[0].lower()))
         if of_real:
             shown = comparison(with_means(table, real), real, numbers)
+            left_out += incomplete(with_means(table, real), real)
             notes = [f"published rows: the paper, {table.source}", *table.notes]
             tables.append(Section(table.title, [shown], facts(of_real, numbers), notes))
             files.append(out / f"paper-{name}.csv")
@@ -636,7 +655,7 @@ def _at_rest(tables: Sequence[PaperTable], runs: Runs) -> dict:
             psnr = [by_seed(of_row, group, "psnr") for *_, of_row in rows]
             for (name, variant, of_row), scores in zip(rows, psnr, strict=True):
                 if scores:
-                    change = _change(scores, psnr[0]) if variant != "full" else None
+                    change = _change(of_row, rows[0][-1], group) if variant != "full" else None
                     order = order_of(change, printed.get(variant))
                     late = of_row.estimate("late")
                     line = [scene, name, printed.get(variant), Estimate.of(scores.values()), change, order]
@@ -721,7 +740,8 @@ def _changes(
             if row.variant not in found:
                 line += [None] * 5
                 continue
-            change = _change(psnr[row.variant], whole) if row.variant != "full" else None
+            of_full = found[row.variant], found["full"], group
+            change = _change(*of_full) if row.variant != "full" else None
             if order := order_of(change, printed.get(row.variant)):
                 fewer = LEAST <= change.count < len(whole)
                 order += f" ({change.count} of {len(whole)} seeds)" * fewer
@@ -730,12 +750,20 @@ def _changes(
             times = step / of_whole if step and of_whole else None
             line += [Estimate.of(psnr[row.variant].values()), change, order, step, times]
     kept = [line for line in lines if any(cell is not None for cell in line[2:])]
-    return Table(columns, kept, "; ".join(captions) + ".")
+    about = "; ".join(captions) + "."
+    if any(group.ability in (row.get(UNPAIRED) or "").split("; ") for row in runs):
+        about += " Which seed has which score was not kept, so that there are no differences in pairs."
+    return Table(columns, kept, about)
 
 
-def _change(scores: Mapping[int, float], whole: Mapping[int, float]) -> Estimate | None:
-    """Estimate how scores by seed differ from those of ``Ours`` with the same seeds."""
-    return Estimate.of(scores[seed] - whole[seed] for seed in scores if seed in whole)
+def _change(runs: Runs, whole: Runs, group: Group) -> Estimate | None:
+    """Estimate how PSNR by seed differs from that of ``Ours`` with the same seeds; None where these share
+    none, or a table does not know which seed has which score.
+    """
+    if any(group.ability in (row.get(UNPAIRED) or "").split("; ") for row in (*runs, *whole)):
+        return None
+    now, before = ({s: {"psnr": v} for s, v in by_seed(own, group, "psnr").items()} for own in (runs, whole))
+    return paired_change([(now[seed], before[seed]) for seed in now if seed in before], "psnr")
 
 
 def order_of(change: Estimate | None, printed: float | None) -> str:

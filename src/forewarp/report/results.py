@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import csv
 import io
+import json
 import math
 import re
 import statistics
@@ -22,7 +23,7 @@ from typing import NamedTuple
 import yaml
 
 from forewarp.files import MOST_CONFIG, load_json, read_json, read_rows, read_text, replace_file
-from forewarp.metrics.registry import metric_of, take_described
+from forewarp.metrics.registry import described_own, metric_of, take_described
 from forewarp.report.settings import (
     CONDITIONS,
     SAME,
@@ -40,6 +41,7 @@ Row = dict
 
 KEY = ("method", "preset", "scene", "minutes", "seed", *CONDITIONS, "overrides", "digest")
 EARLIER = ("density", "steps_per_picture")  # columns of earlier tables, which ``overrides`` tells
+DESCRIBED = "described"  # column of what tables need to know of other packages' metrics, where there are any
 SCORES = ("psnr", "ssim", "lpips")  # that a table has, whether measured or not
 NUMBERS = ("steps", "step", "frame", "parameters", "memory", "ends", "motion_error")
 NUMBERS += ("psnr_space", "psnr_time", "psnr_canonical", "size", "wall", "processor")
@@ -460,10 +462,11 @@ def add_rows(file: Path, rows: Iterable[Row]) -> Runs:
     with_digest = {key[:-1] for key in last if key[-1] is not None}
     kept = [key for key in last if key[-1] is not None or key[:-1] not in with_digest]
     runs = Runs(last[key] for key in sorted(kept, key=_order))
-    text, fields = io.StringIO(), (*KEY, *runs.scores(), *NUMBERS, *TEXTS)
+    text, about = io.StringIO(), described_own(runs.scores())
+    fields = (*KEY, *runs.scores(), *NUMBERS, *TEXTS, *([DESCRIBED] if about else []))
     writer = csv.DictWriter(text, fields, extrasaction="ignore", lineterminator="\n")
     writer.writeheader()
-    writer.writerows(runs)  # None is empty
+    writer.writerows(row | {DESCRIBED: about} for row in runs)  # None is empty
     replace_file(file, text.getvalue())
     return runs
 
@@ -472,7 +475,8 @@ def _read(row: dict[str, str], place: str) -> Row:
     """Turn a row of a CSV file, in the line ``place``, into one of ``read_run``; an older table lacks some
     columns.
     """
-    columns = (*KEY, *SCORES, *NUMBERS, *TEXTS, *EARLIER)
+    take_described(json.loads(row.get(DESCRIBED) or "{}"))
+    columns = (*KEY, *SCORES, *NUMBERS, *TEXTS, *EARLIER, DESCRIBED)
     scores = [*SCORES, *(name for name in row if name not in columns)]
     numbers = ("minutes", "threads", "iterations", "held_out", "train_views", *scores, *NUMBERS)
     typed = {name: row.get(name) or None for name in (*KEY, *TEXTS)}

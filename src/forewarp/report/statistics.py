@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import statistics
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cache
 
 from scipy.special import stdtrit
@@ -31,11 +31,13 @@ class Estimate:
         mean: their mean.
         deviation: the sample's standard deviation; None of a single value.
         count: how many there are.
+        asked: how many seeds there are, of which some may lack what the mean is over; 0: as many as values.
     """
 
     mean: float
     deviation: float | None = None
     count: int = 1
+    asked: int = field(default=0, compare=False, repr=False)
 
     @classmethod
     def of(cls, values: Iterable[float | None]) -> Estimate | None:

@@ -13,12 +13,15 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from forewarp.files import read_rows
-from forewarp.report.results import SCORES, Point, Row, Runs, number_in, pairs, read_runs
+from forewarp.metrics.registry import described_own, take_described
+from forewarp.report.results import DESCRIBED, SCORES, Point, Row, Runs, number_in, pairs, read_runs
 from forewarp.report.settings import name_settings
 
 TEXTS = ("scene", "variant", "ablation", "against", "about", "method", "preset", "ability", "effects")
 TEXTS += ("clock", "device", "torch", "measured", "pictures", "dataset", "origin", "protocol", "day", "curve")
 TEXTS += ("image_format", "command")
+# Column of the kinds of test view, or other columns, of which it is not known which seed has which value.
+UNPAIRED = "unpaired"
 WHOLE = ("seed", "iterations", "held_out", "train_views", "tested", "counterpart", "steps")
 NUMBERS = ("minutes", "threads", "step", "train", "frame", "memory", "parameters", "epe", "late", *WHOLE)
 OF_KIND = "test "  # begins the column of a score of a kind of test view, as in ``test space psnr``
@@ -39,12 +42,15 @@ def stored_csv(runs: Runs) -> str:
     kinds = ((kind, name) for row in runs for kind, scores in row["test"].items() for name in scores)
     of_kind = {f"{OF_KIND}{kind} {name}": (kind, name) for kind, name in kinds}
     file, fields = io.StringIO(), [*TEXTS, "overrides", *NUMBERS, *runs.scores(), *of_kind, "plan"]
+    fields += [UNPAIRED] if any(row.get(UNPAIRED) for row in runs) else []
+    own = described_own(dict.fromkeys([*runs.scores(), *(name for _, name in of_kind.values())]))
+    fields += [DESCRIBED] if own else []
     writer = csv.DictWriter(file, fields, extrasaction="ignore", lineterminator="\n")
     writer.writeheader()
     for row in runs:
         tested = {column: row["test"].get(kind, {}).get(name) for column, (kind, name) in of_kind.items()}
         plan = json.dumps(row["plan"]) if row["plan"] else None
-        writer.writerow(row | tested | {"plan": plan, "counterpart": int(row["counterpart"])})
+        writer.writerow(row | tested | {"plan": plan, "counterpart": int(row["counterpart"]), DESCRIBED: own})
     return file.getvalue()
 
 
@@ -69,11 +75,17 @@ def _row(line: dict[str, str], place: Path, number: int) -> Row:
     row |= {name: int(row[name]) for name in WHOLE if row[name] is not None}
     row |= {name: row[name] or "" for name in ("effects", "about", "image_format")}
     row |= {"counterpart": bool(row["counterpart"])}
-    row |= {"overrides": line.get("overrides"), "folder": place, "measured_at": number}
+    row |= {
+        "overrides": line.get("overrides"),
+        UNPAIRED: line.get(UNPAIRED) or None,
+        "folder": place,
+        "measured_at": number,
+    }
     row |= {"images": [], "config": {}, "metrics": {}}
     row |= {"points": tuple(Point(seconds, psnr, 0) for seconds, psnr in pairs(row["curve"]))}
     row |= {"plan": json.loads(line.get("plan") or "{}"), "test": {}}
-    others = {*TEXTS, *NUMBERS, "overrides", "plan"}
+    take_described(json.loads(line.get(DESCRIBED) or "{}"))
+    others = {*TEXTS, *NUMBERS, "overrides", "plan", DESCRIBED, UNPAIRED}
     scored = [name for name in line if name not in others]
     scores = dict.fromkeys(SCORES) | {name: number_in(line, name, str(place)) for name in scored}
     for column in [name for name in scores if name.startswith(OF_KIND)]:

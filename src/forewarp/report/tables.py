@@ -69,7 +69,8 @@ class Column:
         if value is None or isinstance(value, str):
             return value or ""
         if isinstance(value, Estimate):
-            return self.text(value.mean) + (self._spread(value) if self.spread else "")
+            few = f" [{value.count} of {value.asked} seeds]" if value.asked > value.count else ""
+            return self.text(value.mean) + (self._spread(value) if self.spread else "") + few
         sign = "+" if self.signed or isinstance(value, Difference) else ""
         form = ".4g" if self.digits is None else f".{self.digits}f"
         return f"{self.prefix}{value:{sign}{form}}"
