@@ -65,7 +65,7 @@ def test_the_page_has_scenes_by_minutes_and_keeps_what_was_measured_before(tmp_p
     write_run(later, scene="endless", minutes=None)
     text = write_minutes(later, out)[0].read_text()
     assert rows_of(text, "ball")[0] == ["ball", "31.50 (30.00, 33.00)", "40.00"]
-    assert rows_of(text, "mean of toy") == [["mean of toy", "25.75", ""]]  # no hook of five minutes
+    assert rows_of(text, "mean of toy") == [["mean of toy", "25.00 [1 of 2 seeds]", ""]]  # hook has seed 0
     (details,) = [row for row in rows_of(section(text, "Each"), "ball") if row[1] == "1"]
     assert details[2:5] == ["2", "31.50 (30.00, 33.00)", "0.9000 (0.9000, 0.9000)"]
     assert details[6] == "2.5"  # dB at the ends
@@ -433,3 +433,17 @@ def test_a_column_of_another_version_is_refused_by_name(tmp_path):
     table.write_text("scene,variant,minutes,seed,views\nball,base,1,0,time\n")
     with pytest.raises(ValueError, match=r"forward.csv:2: .* in the column views, but got 'time'"):
         read_stored(table)
+
+
+def test_a_note_of_a_row_is_on_the_page_until_the_row_is_measured_again(tmp_path):
+    for method in ("forward", "nerfies"):
+        write_run(tmp_path / "runs", method, config={"model": {"name": method}, "variant": None}, metrics=TOY)
+    page, table, *_ = write_methods(tmp_path / "runs", tmp_path)
+    head, *lines = table.read_text().splitlines()
+    assert head.endswith(",note")
+    noted = [line + "of before." * line.startswith("nerfies") for line in lines]
+    for _ in range(2):  # the second time from what the first wrote
+        table.write_text("\n".join([head, *noted]))
+        assert "\n\n`nerfies`: of before.\n\n" in write_methods(table, tmp_path)[0].read_text()
+        head, *noted = table.read_text().splitlines()
+    assert "of before" not in write_methods(tmp_path / "runs", tmp_path)[0].read_text()

@@ -21,7 +21,7 @@ from forewarp.metrics.registry import metric_of
 from forewarp.report import figures
 from forewarp.report.results import Row, Runs, add_rows, in_words, length, nothing, read_runs
 from forewarp.report.settings import CONDITIONS, grouped, key_of
-from forewarp.report.statistics import LEAST, by_chance, paired_change, rank, verdict
+from forewarp.report.statistics import LEAST, Estimate, by_chance, paired_change, rank, verdict
 from forewarp.report.stored import is_stored
 from forewarp.report.tables import Column, Table, rendered, score_columns
 
@@ -215,12 +215,22 @@ def _by_minutes(runs: Runs) -> Table:
     cells = {key: group.estimate("psnr") for key, group in runs.by("label", "minutes").items()}
     lines = [[scene, *(cells.get((scene, m)) for m in minutes)] for scene in scenes]
     for dataset, found in runs.by("group").items():
-        columns = [[cells.get((label, m)) for label in found.by("label")] for m in minutes]
-        means = [None if None in column else fmean(cell.mean for cell in column) for column in columns]
+        means = [_mean_of_scenes(found.where(minutes=m), list(found.by("label"))) for m in minutes]
         lines += [[f"mean of {dataset}", *means]] if len(found.by("label")) > 1 else []
     early = any(group.taken()[0] for group in alike(runs))
-    about = " Some runs ended by their steps, before their minutes: see *Each*." * early
+    several = any(len(found.by("label")) > 1 for found in runs.by("group").values())
+    about = " A mean of scenes is over the seeds that all have; those of a seed are averaged first." * several
+    about += " Some runs ended by their steps, before their minutes: see *Each*." * early
     return Table(["scene", *map(length, minutes)], lines, "PSNR (dB) of test views." + about)
+
+
+def _mean_of_scenes(runs: Runs, labels: Sequence[str]) -> Estimate | None:
+    """Estimate PSNR over the seeds that all scenes have, of the mean over scenes; None if there is none."""
+    scores = {(row["label"], row["seed"]): row["psnr"] for row in runs if row["psnr"] is not None}
+    seeds = list(dict.fromkeys(seed for _, seed in scores))
+    shared = [seed for seed in seeds if all((label, seed) in scores for label in labels)]
+    found = Estimate.of(fmean(scores[label, seed] for label in labels) for seed in shared)
+    return found and replace(found, asked=len(seeds))
 
 
 def _against_fewer(runs: Runs, varied: str, order: Callable[[Runs], float]) -> list[dict]:
@@ -371,6 +381,8 @@ def write_methods(folder: Path, out: Path) -> list[Path]:
         scenes.append({"name": scene, "pictures": pictures, "tables": tables})
         written += drawn
     about = {"machine": made_on(runs), "command": runs.command()}
+    noted = grouped((row["note"], f"`{row['method']}`") for row in runs if row.get("note"))
+    about["notes"] = [f"{', '.join(dict.fromkeys(names))}: {note}" for note, names in noted.items()]
     about |= {"presets": list(runs.by("preset")), "departures": _departures(runs), "left_out": left_out}
     with_steps = (out / "faithful-step.md").is_file()  # by python -m tests.bench.faithful
     replace_file(page, rendered("methods.md.j2", scenes=scenes, with_steps=with_steps, **about))

@@ -45,7 +45,7 @@ DESCRIBED = "described"  # column of what tables need to know of other packages'
 SCORES = ("psnr", "ssim", "lpips")  # that a table has, whether measured or not
 NUMBERS = ("steps", "step", "frame", "parameters", "memory", "ends", "motion_error")
 NUMBERS += ("psnr_space", "psnr_time", "psnr_canonical", "size", "wall", "processor")
-TEXTS = ("dataset", "day", "commit", "departures", "faults", "views", "curve", "command")
+TEXTS = ("dataset", "day", "commit", "departures", "faults", "views", "curve", "command", "note")
 # Kinds of test view, and parts of their pixels, that scores are of.
 KINDS = {"space": "at training times", "time": "between training times", "canonical": "at the canonical time"}
 KINDS |= {"space_time": "of cameras and between times held out", "all": "all"}
