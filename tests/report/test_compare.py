@@ -122,3 +122,26 @@ def test_what_is_no_run_is_refused(runs, in_tmp):
     ):
         with pytest.raises(ValueError, match=f"^{line}"):
             read_compared(folders)
+
+
+def test_differences_are_in_pairs_by_seed_and_view_and_say_where_no_seed_is_shared(in_tmp):
+    def table_of(first, second):
+        shutil.rmtree("runs", ignore_errors=True)
+        for method, seeds in (("forward", first), ("backward", second)):
+            for seed in seeds:
+                metrics = of(method, {"psnr": 30.0, "lpips_alex": 0.1 * (1 + (method == "forward"))})
+                made = write_run("runs", method, seed, config={"model": {"name": method}}, metrics=metrics)
+                lpips = {"a": 0.5, "b": 0.1} if method == "forward" else {"a": 0.1}
+                scores = {name: {"psnr": 30.0, "lpips_alex": value} for name, value in lpips.items()}
+                images = [{"name": n, "time": 0.5, "ability": "all", "scores": s} for n, s in scores.items()]
+                (made / "per_image.json").write_text(json.dumps({"images": images}))
+        table = compare(read_compared(sorted(in_tmp.glob("runs/**/*seed*"))))
+        return {row[0]: row[-1] for row in table.rows}, table.caption
+
+    rows, caption = table_of((0, 1, 2), (0, 1, 2))
+    assert rows["LPIPS (alex), all"] == "-0.4000 ± 0.0000"  # of view a, which both have
+    assert caption.endswith("differences are paired by seed")
+    rows, caption = table_of((0, 1), (2, 3))
+    assert (rows["all"], rows["steps"], "paired" in caption) == ("no seed in common", None, False)
+    rows, caption = table_of((0,), (2,))
+    assert (rows["all"], caption) == ("+0.00", "differences are of one run each, of other seeds")

@@ -127,7 +127,7 @@ def cheapest(groups: Mapping[tuple, Runs]) -> Table:
             seconds, row = min(known, key=lambda pair: pair[0].mean)
             lines.append([str(psnr), seconds, row["variant"], f"`{row['command']}`"])
     columns = ["for dB", Column("seconds", 1), "variant", "command"]
-    return Table(columns, lines, "The cheapest way to each PSNR, by the means:")
+    return Table(columns, lines, "The cheapest way to each PSNR, by the means alone, without a verdict:")
 
 
 def variants(groups: Mapping[tuple, Runs], target: float) -> Table:
@@ -356,21 +356,33 @@ def compare(groups: Mapping[str, Runs]) -> Table:
     same_scene = len({(row["dataset"], row["scene"]) for row in rows}) == 1
     same_views = same_scene and len({row["measured"] for row in rows}) == 1
     seeds = [sorted(row["seed"] for row in own) for own in groups.values()]
+    is_paired = two and bool({*seeds[0]} & {*seeds[1]})
+    alone = two and max(map(len, seeds)) == 1  # of other seeds, too, there is a difference
 
     def add(
-        name: str, value: Callable[[Row], float | None], digits: int, with_difference: bool = False
+        name: str,
+        value: Callable[[Row], float | None],
+        digits: int,
+        with_difference: bool = False,
+        kind: str = "",
+        measure: str = "",
     ) -> None:
         values = [[value(row) for row in own] for own in groups.values()]
         if any(None in own for own in values):
             return
         column, difference = Column("", digits), None
         if with_difference and two:
-            by_seed = [dict(zip((r["seed"] for r in own), v)) for own, v in zip(groups.values(), values)]
-            shared = [seed for seed in by_seed[0] if seed in by_seed[1]]
-            alone = len(values[0]) == len(values[1]) == 1  # whatever their seeds
-            changes = [by_seed[0][seed] - by_seed[1][seed] for seed in shared]
-            difference = Estimate.of([values[0][0] - values[1][0]] if alone else changes)
+            scored = [
+                Runs(
+                    {"seed": r["seed"], measure: value(r), "images": r["images"], "ability": kind}
+                    for r in own
+                )
+                for own in groups.values()
+            ]
+            pairs = [(scored[0][0], scored[1][0])] if alone else scored[0].paired(scored[1])
+            difference = paired_change(pairs, measure)
         told = None if difference is None else replace(column, signed=True).text(difference)
+        told = "no seed in common" if with_difference and two and difference is None else told
         lines.append([name, *(column.text(Estimate.of(own)) for own in values), *[told] * two])
 
     every = [row for own in groups.values() for row in own]
@@ -378,8 +390,9 @@ def compare(groups: Mapping[str, Runs]) -> Table:
     for metric in map(metric_of, dict.fromkeys([*METRICS, *added])):
         for kind, words in KINDS.items() if metric.summary else ():
             name = words if metric.name == "psnr" else f"{metric.heading}, {words}"
-            add(name, partial(_score, kind, metric.name), metric.digits, same_views)
-    add("moving points' error, % of motion", _motion_share, 0, same_scene)
+            score = partial(_score, kind, metric.name)
+            add(name, score, metric.digits, same_views, kind, metric.name)
+    add("moving points' error, % of motion", _motion_share, 0, same_scene, measure="motion_error")
     for name, (words, digits) in MEASURED.items():
         add(words, partial(_measured, name), digits)
     for name, words in SHOWN_CONDITIONS.items():
@@ -391,8 +404,10 @@ def compare(groups: Mapping[str, Runs]) -> Table:
     if max(map(len, seeds)) > 1:
         listed = "; ".join(f"{name}: seeds {', '.join(map(str, own))}" for name, own in zip(groups, seeds))
         told.append(f"{INTERVALS}; {listed}")
-        if two and same_views:
+        if is_paired and same_views:
             told.append("differences are paired by seed")
+    if alone and same_views and not is_paired:
+        told.append("differences are of one run each, of other seeds")
     if not set.intersection(*(set(row["test"]) for row in every)):
         kinds = (f"{name}: {', '.join(own[0]['test']) or 'none'}" for name, own in groups.items())
         told.append(f"no metrics: no kind of test view was measured in all runs ({'; '.join(kinds)})")
