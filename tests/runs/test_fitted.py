@@ -282,6 +282,16 @@ def test_low_psnr_names_the_three_likeliest_causes_of_the_format(steps, first):
     assert first in causes[0]
 
 
+def test_a_target_that_was_reached_is_no_reason_to_train_longer():
+    reached = {"target": {"psnr": 20.0, "reached": "target.psnr"}}
+    assert doubts(run(steps=9, **reached), reaching(30), "fast") == []
+    _, *causes = doubts(run(steps=9, suspects=DNeRFDataModule.suspects, **reached), reaching(12.9), "fast")
+    assert causes
+    assert not [cause for cause in causes if "raise the budget" in cause]
+    missed = {"target": {"psnr": 20.0, "reached": None}}
+    assert "raise budget.minutes" in doubts(run(steps=9, **missed), reaching(30), "fast")[0]
+
+
 @pytest.mark.parametrize("preset", ["demo", "fast", "faithful"])
 def test_advice_fits_the_preset_and_is_given_once(preset):
     few, _, *causes = doubts(run(steps=9), reaching(12.9), preset)

@@ -464,6 +464,7 @@ class TellBest(Callback):
 FEW = 50  # steps of a stage that can hardly have learned anything, if there were fewer
 SHORT = 1000  # steps of a run, or fewer, that may be all that is wrong with it
 LOW, ABOVE = 21.0, 5.0  # dB; a fit is in doubt below LOW, or less than ABOVE better than one colour
+_MORE = "raise the budget"  # which is no advice where a target ended training
 _VIEWS, _PIXELS = 8, 2000  # training images that are looked at, and pixels of each
 
 
@@ -476,24 +477,25 @@ def doubts(run: Run, module: DynamicSceneModule, preset: str) -> list[str]:
     """Return lines that say what is wrong with a fitted run, and its likeliest causes; none if all is well.
 
     A stage that minutes ended after few steps, cameras that see nothing of the box, and training images that
-    were not trained on or that the fit does not show are doubted. A stage whose steps were asked for is not.
+    were not trained on or that the fit does not show are doubted. A stage whose steps were asked for, or that
+    its target ended, is not.
 
     Cost: some thousand pixels of eight training images are rendered.
     """
     lines, made, scene = [], run.finished(), run.datamodule.scene
     smaller = "" if preset == "demo" else "take preset=demo, whose steps are smaller, "
+    ended = next((noted["target"]["reached"] for noted in made.values() if "target" in noted), None)
     for stage in run.stages:
         name = stage.settings.name
         most = stage.settings.over(len(scene.train)).iterations
         steps, seconds = made[name]["steps"], made[name]["seconds"]
-        if steps < min(FEW, most or FEW):
+        if steps < min(FEW, most or FEW) and not (ended and "target" in made[name]):
             few = f"ended after {steps} step{'s' * (steps != 1)} in {seconds:.1f} s, too few to learn"
             advice = f"raise budget.minutes, give it more of them (stage.{name}.share), {smaller}"
             lines.append(f"stage.{name} {few}; {advice}or leave it out (~stage.{name})")
     in_play = max(noted.get("frames_in_play", len(scene.train)) for noted in made.values())
     if in_play < len(scene.train) and run.stages[-1].settings.curriculum.get("most") is None:
         never = f"{len(scene.train) - in_play} of {len(scene.train)} training images were never trained on"
-        ended = next((n["target"]["reached"] for n in made.values() if "target" in n), None)
         advice = f"{ended} ended training before their times came in" if ended else ""
         lines.append(f"{never}, as {advice or 'the budget ended before their times came in; raise it'}")
     if blind := blind_frames(scene):
@@ -503,7 +505,8 @@ def doubts(run: Run, module: DynamicSceneModule, preset: str) -> list[str]:
         far = f"training images are reached to {reached:.1f} dB"
         lines.append(f"{far}; one color alone has {one_color:.1f} dB")
         steps = sum(noted["steps"] for noted in made.values())
-        causes = _likeliest(run.datamodule.suspects, steps, preset)[:3]
+        causes = _likeliest(run.datamodule.suspects, steps, preset)
+        causes = [cause for cause in causes if not (ended and cause.endswith(_MORE))][:3]
         lines += [f"  likely cause {number}: {cause}" for number, cause in enumerate(causes, 1)]
     return lines
 
@@ -513,8 +516,7 @@ def _likeliest(suspects: Sequence[str], steps: int, preset: str) -> list[str]:
     kept = [cause for cause in suspects if preset == "demo" or "preset=demo" not in cause]
     if steps >= SHORT:
         return kept
-    more = "raise the budget"
-    return [f"too little training, {steps} steps: {more}", *(one for one in kept if not one.endswith(more))]
+    return [f"too little training, {steps} steps: {_MORE}", *(one for one in kept if not one.endswith(_MORE))]
 
 
 def tell(lines: Iterable[str]) -> None:
