@@ -126,7 +126,9 @@ def test_trackers_get_a_name_for_each_thing(fitted):
     ]
     assert groups[0] == groups[1] >= {"density", "color", "flow"}
     (text,) = events.Tensors("config/text_summary")
-    assert (fitted / "config.yaml").read_text() in text.tensor_proto.string_val[0].decode()
+    logged, stored = text.tensor_proto.string_val[0].decode(), (fitted / "config.yaml").read_text()
+    assert "fine:" in logged
+    assert [str(fitted.parent) in one for one in (stored, logged)] == [True, False]
     (film,) = events.Images("film/test")
     assert (film.step, film.width, film.height) == (sum(content["steps"].values()), 32, 32)
     assert film.encoded_image_string == (fitted / "videos" / "test.gif").read_bytes()

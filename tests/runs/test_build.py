@@ -140,7 +140,7 @@ def test_hyperparameters_are_keys_and_values_as_they_are_typed_each_once(model, 
     config = OmegaConf.create(plain(as_made)) if stored else as_made
     config.command = f"forewarp-train experiment=demo data.root=/home/me/scenes run=/tmp/run model={model}"
     found = build.hyperparameters(config)
-    assert found.pop("command") == f"forewarp-train experiment=demo model={model}"
+    assert found.pop("command") == f"forewarp-train experiment=demo data.root=scenes run=run model={model}"
     assert found["objective.fine.weights.photo"] == 0.5
     assert not any("/" in str(value) or "root" in name for name, value in found.items())
     assert not any(".objective." in name for name in found)
@@ -153,6 +153,15 @@ def test_hyperparameters_are_keys_and_values_as_they_are_typed_each_once(model, 
     again = composed(*words[:2], *typed)
     config.command = None
     assert plain(again) == plain(config)
+
+
+def test_hyperparameters_tell_apart_runs_of_another_target_or_start():
+    typed = ["target.psnr=31", "start=/home/me/runs/still", "+preset.bases=4", "+preset.mine=${.bases}"]
+    found, plainly = (build.hyperparameters(config_of(*words)) for words in (typed, []))
+    assert {key: found[key] for key in found.keys() - plainly} == {
+        **{"target.psnr": 31, "target.plateau": "null", "start": "still"},
+        **{"preset.bases": 4, "preset.mine": 4},  # a relative key is resolved in place
+    }
 
 
 def test_runs_of_a_folder_share_decoded_frames(tmp_path, monkeypatch):

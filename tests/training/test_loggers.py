@@ -11,7 +11,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from forewarp.drawing.images import write_video
 from forewarp.files import read_json, read_rows
 from forewarp.training.callbacks import Scalars
-from forewarp.training.loggers import CsvLogger, Labels, RunLoggers
+from forewarp.training.loggers import CsvLogger, Labels, RunLoggers, redacted
 from tests.support.tiny_scene import Interrupt, make_run, stage
 
 STEPS = 6
@@ -37,7 +37,7 @@ def logged(folder, makers, *callbacks):
     """Train two stages of six steps with loggers, and log the scores of the run."""
     labels = Labels("ball", "minutes", ("pilot", "two"), True)
     (folder / "run").mkdir(exist_ok=True)
-    (folder / "run" / "config.yaml").write_text("seed: 7\n")
+    (folder / "run" / "config.yaml").write_text("seed: 7\nroot: /home/me/my scans\n")
     write_video(folder / "test.gif", [torch.rand(8, 10, 3) for _ in range(3)], fps=8)
     loggers = RunLoggers(makers, folder / "run", folder, lambda: PARAMETERS, labels)
     stages = [stage(name, iterations=STEPS) for name in ("coarse", "fine")]
@@ -93,7 +93,7 @@ def test_stages_are_one_curve_and_a_continued_run_goes_on_in_it(tmp_path, plain)
     (film,) = events.Images("film/test")
     assert (film.step, film.width, film.height) == (12, 10, 8)
     assert film.encoded_image_string == (tmp_path / "test.gif").read_bytes()
-    assert b"seed: 7" in events.Tensors("config/text_summary")[0].tensor_proto.string_val[0]
+    assert b"seed: 7\nroot: my scans\n" in events.Tensors("config/text_summary")[0].tensor_proto.string_val[0]
     (table,) = (events.SummaryMetadata("_hparams_/session_start_info").plugin_data.content,)
     assert b"stage.fine.density" in table
 
@@ -192,3 +192,24 @@ def test_a_package_that_is_missing_is_named(tmp_path, monkeypatch):
     monkeypatch.setattr("forewarp.training.loggers.find_spec", lambda name: None)
     with pytest.raises(ImportError, match="expected wandb for mine, but got none; install forewarp.tr"):
         RunLoggers({"mine": partial(WandbLogger)}, tmp_path)
+
+
+def test_paths_and_passwords_reach_no_tracker():
+    command = (
+        "forewarp-train --config-dir=/home/me/conf 'data.root=/srv/x/my scans' model/motion=none run=a/b"
+    )
+    command += " 'hydra.searchpath=[file:///home/me/a,/home/me/b,pkg://c]' start=/home/me"
+    uris = [
+        "https://me:p@ss@host:80/a",
+        "logger.mlflow.tracking_uri=http://u@host",
+        "sqlite:////home/me/m.db",
+    ]
+    config = {"command": command, "root": "/home/me/x y", "uris": uris, "path": "/a/b:/c/d", "seed": 1}
+    config |= {"depth": "${data.root}/depth", "out": "../a/b", "none": None}
+    assert redacted(config) == {
+        "command": "forewarp-train --config-dir=conf 'data.root=my scans' model/motion=none run=a/b"
+        " 'hydra.searchpath=[a,b,pkg://c]' 'start=~'",
+        "root": "x y",
+        "uris": ["https://host:80/a", "logger.mlflow.tracking_uri=http://host", "m.db"],
+        **{"path": "b:d", "seed": 1, "depth": "${data.root}/depth", "out": "../a/b", "none": None},
+    }

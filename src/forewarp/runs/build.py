@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import json
 import re
-import shlex
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from functools import partial, reduce
+from operator import getitem
 from pathlib import Path
 
 import torch
@@ -22,12 +22,21 @@ from forewarp.data.files import mismatch, one_of, whole
 from forewarp.data.films import FOLDER
 from forewarp.evaluation.curves import AccuracyCurve
 from forewarp.provenance import RESULTS
-from forewarp.runs.config import IDENTITY, instead_of, is_swept, plain, saved_config, trust_of
-from forewarp.runs.overrides import TEXTS, constant, key_of, typed_overrides
+from forewarp.runs.config import (
+    IDENTITY,
+    IDENTITY_IF_SET,
+    instead_of,
+    is_swept,
+    plain,
+    saved_config,
+    set_value,
+    trust_of,
+)
+from forewarp.runs.overrides import constant, key_of, typed_overrides
 from forewarp.scene.cloud import Handover
 from forewarp.training.callbacks import StageProgress
 from forewarp.training.checkpoints import load_handover
-from forewarp.training.loggers import Labels, RunLoggers
+from forewarp.training.loggers import Labels, RunLoggers, redacted
 from forewarp.training.module import DynamicSceneModule
 from forewarp.training.schedule import StagePlan, seconds_after, share_out
 from forewarp.training.stages import Run
@@ -35,7 +44,7 @@ from forewarp.training.stopping import StopRule
 
 PROFILERS = {"simple": SimpleProfiler, "advanced": AdvancedProfiler}  # Lightning's
 _LEVELS = 4  # that a run may lie below the folder of all runs
-_FOLLOWS = re.compile(r"\$\{([\w.]+)\}")  # one key that has the value of another one
+_FOLLOWS = re.compile(r"\$\{(\w[\w.]*)\}")  # one key that has the value of another one
 _PLACES = re.compile(r"data\.root|paths\.|trainer\.(accelerator|devices)")  # where, not what
 PROFILE = "profile"  # of a file's name: fit-profile.txt
 
@@ -193,21 +202,28 @@ def packages_of(config: DictConfig) -> list[str]:
 def hyperparameters(config: DictConfig) -> dict[str, object]:
     """List what makes a run what it is, for the tables of its loggers: keys and values as they are typed.
 
-    Each is there once: a key that follows another one stands there as that other one. Paths are left out.
+    Each is there once: a key that follows another one stands there as that other one. Folders of data and
+    runs are left out.
 
-    ``command`` is the command without paths, ``sweeps`` the sweep that the run is a job of.
+    ``command`` is the command, ``sweeps`` the sweep that the run is a job of. All are ``redacted``.
     """
-    words = [word for word in shlex.split(config.get("command") or "") if not TEXTS.fullmatch(key_of(word))]
-    found: dict[str, object] = {"command": shlex.join(words)} if words else {}
+    found: dict[str, object] = {"command": command} if (command := config.get("command")) else {}
     if HydraConfig.initialized() and (sweep := HydraConfig.get().runtime.choices.get("sweeps")):
         found["sweeps"] = sweep
     if tags := (config.get("trackers") or {}).get("tags"):
         found["trackers.tags"] = json.dumps(plain(tags))
     unresolved = OmegaConf.to_container(config)
 
+    def followed(value: object) -> tuple[object, str] | None:
+        """Return what a key follows, and its name; None where it is resolved in place."""
+        if isinstance(value, str) and (match := _FOLLOWS.fullmatch(value)):
+            with suppress(KeyError, TypeError):  # of a key below another interpolation, or in a list
+                return reduce(getitem, match[1].split("."), unresolved), match[1]
+        return None
+
     def walk(value: object, name: str) -> None:
-        if isinstance(value, str) and (followed := _FOLLOWS.fullmatch(value)):
-            walk(reduce(lambda part, key: part[key], followed[1].split("."), unresolved), followed[1])
+        if (other := followed(value)) is not None:
+            walk(*other)
         elif isinstance(value, dict):
             for key, inner in value.items():
                 # A stored config has copies of the objectives in place of what follows them.
@@ -218,10 +234,11 @@ def hyperparameters(config: DictConfig) -> dict[str, object]:
             value = plain(OmegaConf.select(config, name))
             found[name] = value if isinstance(value, bool | int | float | str) else json.dumps(value)
 
-    for key in (*IDENTITY, "capture", "variant", "threads", "trainer"):
+    set_keys = [key for key in IDENTITY_IF_SET if set_value(config, key) is not None]
+    for key in (*IDENTITY, *set_keys, "capture", "variant", "threads", "trainer"):
         if unresolved.get(key) is not None:
             walk(unresolved[key], key)
-    return found
+    return redacted(found)
 
 
 def _is_fixed(target: object) -> bool:

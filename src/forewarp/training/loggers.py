@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import csv
 import os
+import re
+import shlex
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
@@ -15,6 +17,7 @@ from pathlib import Path
 from filelock import FileLock
 from lightning.pytorch.loggers import CSVLogger, Logger, MLFlowLogger, TensorBoardLogger, WandbLogger
 from lightning.pytorch.loggers.csv_logs import ExperimentWriter
+from omegaconf import OmegaConf
 from tensorboard.compat.proto.summary_pb2 import Summary
 from torch import Tensor
 
@@ -23,6 +26,9 @@ from forewarp.files import MOST_CONFIG, read_json, read_text, write_json
 
 IDS = "loggers.json"  # in the run's folder: which run of its tracker each logger goes on with
 _PACKAGES = {WandbLogger: "wandb", MLFlowLogger: "mlflow"}
+_USER = re.compile(r"(?<=://)[^\s/]*@")  # user and password of a URI
+_PATH = re.compile(r"(?:\b(?:file|sqlite):/*|(?<![\w./~:})\]])|(?<=:)(?!//))/[^,:;=\[\]{}'\"\n]+")
+_HOME = re.compile(r"/root|(/home|/Users)/[^/]+")
 
 
 class CsvLogger(CSVLogger):
@@ -159,7 +165,7 @@ class RunLoggers:
         if not (known and kind is MLFlowLogger):  # which takes each parameter once
             logger.log_hyperparams(dict(self.hyperparameters()))
         if self.labels.config and not known and (file := self.folder / "config.yaml").is_file():
-            self._guard(name, _log_text, logger, "config", read_text(file, MOST_CONFIG), step)
+            self._guard(name, _log_config, logger, file, step)
         self._closing.append(logger.finalize)
         log_metrics = logger.log_metrics
 
@@ -244,6 +250,37 @@ class RunLoggers:
             if isinstance(logger, WandbLogger):  # else the next job of a sweep would go on in this run
                 self._guard(name, logger.experiment.finish, exit_code=0 if kind is None else 1)
         self._open, self._closing = None, []
+
+
+def redacted(value: object) -> object:
+    """Replace what is of this machine and user alone, also within dicts, lists and commands.
+
+    Absolute paths by their last part, a home folder by ``~``; user and password of URIs are left out.
+
+    >>> redacted(["data.root=/home/me/my scans", "https://me:secret@host/mlflow", "model/motion=none", 3])
+    ['data.root=my scans', 'https://host/mlflow', 'model/motion=none', 3]
+    >>> redacted("forewarp-train --config-dir=/home/me 'hydra.searchpath=[file:///a/b,pkg://c]' out=a/b")
+    "forewarp-train '--config-dir=~' 'hydra.searchpath=[b,pkg://c]' out=a/b"
+    """
+    if isinstance(value, dict):
+        return {key: redacted(inner) for key, inner in value.items()}
+    if isinstance(value, list | tuple):
+        return [redacted(inner) for inner in value]
+    if not isinstance(value, str):
+        return value
+    if value.startswith("forewarp-"):  # a command, in which a space ends a path
+        return shlex.join(_PATH.sub(_last_part, _USER.sub("", word)) for word in shlex.split(value))
+    return _PATH.sub(_last_part, _USER.sub("", value))
+
+
+def _last_part(path: re.Match) -> str:
+    absolute = "/" + re.sub(r"^\w*:?/*", "", path[0]).rstrip("/")
+    return "~" if _HOME.fullmatch(absolute) else absolute.rpartition("/")[2]
+
+
+def _log_config(logger: Logger, file: Path, step: int) -> None:
+    content = OmegaConf.to_container(OmegaConf.create(read_text(file, MOST_CONFIG)))
+    _log_text(logger, "config", OmegaConf.to_yaml(redacted(content)), step)
 
 
 def _log_text(logger: Logger, title: str, text: str, step: int) -> None:
