@@ -120,6 +120,14 @@ def test_a_failed_sweep_stops_no_other_and_its_status_is_kept(monkeypatch):
     assert sorted(called) == sorted([("train", "1 | ")] * 3 + [("train", "2 | "), ("report", "")])
 
 
+def test_what_a_page_costs_lists_each_run_where_that_is_asked_for(in_tmp):
+    job = plan_of("accuracy-time", Keys.typed(["changes=stage.fine.density=45,90", "more=trainer=cpu"]))
+    first, *lines = reproduce.cost_of(job, listed=True)
+    assert first == "3 jobs; 1 at a time"
+    assert ["runs/accuracy_time/vehicle/" in line for line in lines].count(True) == 3
+    assert not any("runs/accuracy_time" in line for line in reproduce.cost_of(job))
+
+
 def test_make_hands_over_what_was_typed():
     words = ["make", "-n", "-C", str(ROOT), "reproduce-tables", "DATA=there", "SCENES=hook lego", "SEEDS=3"]
     said = subprocess.run(words, check=True, capture_output=True, text=True).stdout

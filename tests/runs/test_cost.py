@@ -122,6 +122,23 @@ def test_jobs_add_up_over_workers_and_those_done_are_left_out(monkeypatch):
     assert (both.wall, both.jobs, both.to_do, both.disk) == (pytest.approx(1050.0), 21, 12, 24e6)
 
 
+@pytest.mark.parametrize(
+    ("data", "expected"),
+    [
+        ({"synthesis": {"test_views": [1, 2, 3], "size": 10, "frames": 5}}, (6, 100)),
+        ({"synthesis": {"test_views": [1, 2, 3], "size": 10, "frames": 5, "motions": ["lift"]}}, (17, 100)),
+        (
+            {"synthesis": {"test_views": [1, 0, 0], "size": 500, "frames": 5}, "half_resolution": "auto"},
+            (1, 62_500),
+        ),
+        ({"synthesis": {"size": 10, "frames": 5}}, (None, None)),
+        ({}, (None, None)),
+    ],
+)
+def test_test_views_of_a_scene_to_be_written_are_known_by_its_config(data, expected):
+    assert cost._views_to_write(OmegaConf.create(data)) == expected
+
+
 def test_rows_are_kept_and_read_and_a_broken_file_is_none(tmp_path, monkeypatch):
     monkeypatch.setenv(cost.FILE_VARIABLE, str(tmp_path / "new" / "times.csv"))
     assert read_costs(own_file()) == []

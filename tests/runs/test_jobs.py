@@ -4,7 +4,7 @@ import pytest
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf, read_write
 
-from forewarp.runs import jobs
+from forewarp.runs import cost, jobs
 from forewarp.runs.config_files import configurations
 from forewarp.runs.jobs import at_once, cost_of_sweep, is_local, jobs_of
 from forewarp.runs.overrides import constant, key_of
@@ -60,6 +60,7 @@ def test_a_sweep_is_told_by_its_jobs_in_a_few_lines_and_listed(sweep, monkeypatc
         (done / name / "done.json").write_text("{}")
     costs, whole = cost_of_sweep(config)
     assert [job.state for job, _ in costs] == ["", ""]
+    assert {(job.like.views, job.like.pixels) for job, _ in costs} == {(30, 10_000)}  # to be written
     (done / "metrics.json").write_text("{}")
     lines = jobs.tell_sweep(config, listed=True)
     assert lines[0] == "2 jobs: 1 finished before, 1 to do"
@@ -67,6 +68,22 @@ def test_a_sweep_is_told_by_its_jobs_in_a_few_lines_and_listed(sweep, monkeypatc
     assert lines[-1] == f"   finished  {done}"
     assert lines[-2].endswith(f"  {tmp_path / 'runs' / 'particles'}")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["runs"]
+
+
+def test_a_few_jobs_stand_for_many_unless_each_is_asked_for(sweep, monkeypatch):
+    composed, read = [], []
+    monkeypatch.setattr(jobs, "_MOST", 3)
+    monkeypatch.setattr(jobs, "compose", lambda *a, **k: composed.append(a[1]) or compose(*a, **k))
+    monkeypatch.setattr(cost, "_views_of", lambda *_: read.append(1) or (None, None))
+    config = sweep(*SMALL, "data.held_out=0,1,2,3,4", "model=particles,forward", "seed=0,1")
+    costs, whole = cost_of_sweep(config, every=False)
+    assert (len(composed), len(read), len(costs), len({job.folder for job, _ in costs})) == (3, 0, 20, 20)
+    assert sorted(job.like.model for job, _ in costs) == ["forward"] * 10 + ["particles"] * 10
+    assert (whole.alike, whole.training) == (14, pytest.approx(20 * 30.0))
+    assert any(line.startswith("  14 of them are taken to be like others") for line in whole.lines())
+    composed.clear()
+    assert cost_of_sweep(sweep(*SMALL, "data.held_out=0,1,2,3"))[1].alike == 0
+    assert (len(composed), len(read)) == (4, 4)
 
 
 def test_a_search_has_as_many_jobs_as_it_is_given(sweep):

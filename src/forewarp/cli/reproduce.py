@@ -33,7 +33,7 @@ Keys (capitals do, too):
   launcher=NAME     where jobs run, as of forewarp-train;  device=cpu|gpu  of gpu
   more="K=V ..."    overrides added to every sweep
   small=1           tiny scenes and a few steps, to try the command
-  plan_only=true    say how many runs there are and what they will take, and end there; without it that is
+  plan_only=true    say how many runs there are and what each will take, and end there; without it a sum is
                     said first (not with small=1)
 """
 
@@ -354,8 +354,8 @@ def gpu(keys: Keys) -> Job:
     return Job([lane], then)
 
 
-def cost_of(job: Job) -> list[str]:
-    """Say in lines how many runs a job has, and what they will take.
+def cost_of(job: Job, *, listed: bool = False) -> list[str]:
+    """Say in lines how many runs a job has, and what they will take; with ``listed`` also each of them.
 
     Raises:
         ValueError, HydraException, OmegaConfBaseException: if a run is no possible one.
@@ -364,7 +364,9 @@ def cost_of(job: Job) -> list[str]:
     from omegaconf import read_write
 
     from forewarp.runs.cost import Total, joined
-    from forewarp.runs.jobs import cost_of_sweep
+    from forewarp.runs.jobs import cost_of_sweep, listing
+
+    lines = []
 
     def total_of(sweep: Sweep) -> Total:
         typed = arguments_of("train", sweep)
@@ -374,11 +376,13 @@ def cost_of(job: Job) -> list[str]:
             config.hydra.overrides.task = [word for word in typed if not word.startswith("hydra.")]
         overrides.constant.clear()
         overrides.constant.update(map(key_of, single))
-        return cost_of_sweep(config)[1]
+        costs, whole = cost_of_sweep(config, every=listed)
+        lines.extend(listing(costs))
+        return whole
 
     with initialize_config_dir(str(configurations()), version_base="1.3"):
         lanes = [[total_of(sweep) for sweep in lane] for lane in job.lanes]
-    return joined(lanes, min(job.jobs, len(lanes))).lines()
+    return [*joined(lanes, min(job.jobs, len(lanes))).lines(), *(lines if listed else [])]
 
 
 KINDS = demo, tables, ablations, accuracy_time, price_list, effects, gpu
@@ -438,7 +442,7 @@ def main() -> None:
     plan_only = keys.plan_only not in ("", "false", "0")
     try:
         if plan_only or not keys.small:
-            print(*cost_of(job), sep="\n", flush=True)
+            print(*cost_of(job, listed=plan_only), sep="\n", flush=True)
     except Exception as error:
         line = one_line(error) or flat(str(error))
         if plan_only:

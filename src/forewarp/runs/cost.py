@@ -91,6 +91,7 @@ class Job:
         may_end: whether it may end before its budget.
         evaluate: whether test views are measured.
         plans: whether its effects are planned first.
+        alike: whether it was not looked at, but is taken to be like another one, and not finished.
     """
 
     folder: Path
@@ -102,6 +103,7 @@ class Job:
     may_end: bool = False
     evaluate: bool = True
     plans: bool = False
+    alike: bool = False
 
 
 @dataclass
@@ -160,12 +162,13 @@ def write_costs(file: Path, rows: Iterable[Row]) -> None:
             writer.writerow({n: f"{v:.6g}" if isinstance(v, float) else v for n, v in cells.items()})
 
 
-def job_of(config: DictConfig, rows: Sequence[Row] = ()) -> Job:
+def job_of(config: DictConfig, rows: Sequence[Row] = (), *, read: bool = True) -> Job:
     """Read from a composed config what a job is; write nothing.
 
     Args:
         config: composed; its ``run`` is filled in.
-        rows: of jobs of this machine, which know the test views of a procedural scene not yet written.
+        rows: of jobs of this machine, which know the test views of a scene that is not read.
+        read: whether to count the test views of a scene that is there, which reads all of it.
 
     Raises:
         ValueError: for a budget that there cannot be.
@@ -179,7 +182,9 @@ def job_of(config: DictConfig, rows: Sequence[Row] = ()) -> Job:
     config = hashed(config)
     folder, like = Path(str(config.run)), likeness(config)
     state = "finished" if _is_finished(config, folder) else ""
-    views, pixels = _views_of(config, state)
+    views, pixels = _views_of(config, state) if read else (None, None)
+    if views is None and config.evaluate:
+        views, pixels = _views_to_write(config.data)
     if views is None:
         known = [row for row in rows if row.scene == like.scene and row.views]
         views, pixels = (known[-1].views, known[-1].pixels) if known else (None, None)
@@ -387,6 +392,22 @@ def _views_of(config: DictConfig, state: str) -> tuple[int | None, int | None]:
     return _views[key]
 
 
+def _views_to_write(data: DictConfig) -> tuple[int | None, int | None]:
+    """Count the test views of a procedural scene and the pixels of one, by its config; None where that does
+    not say.
+    """
+    made = plain(data.get("synthesis")) or {}
+    if not {"test_views", "size", "frames"} <= made.keys():
+        return None, None
+    space, time, canonical = made["test_views"]
+    if "motions" in made:  # Lego Complete's: views at each training time, and steps between these
+        space, time = space * made["frames"], time * (made["frames"] - 1) + 1 if time else 0
+    size, half = made["size"], data.get("half_resolution", False)
+    if half is True or (half == "auto" and size > 400):
+        size //= 2
+    return space + time + canonical, size**2
+
+
 @dataclass
 class Total:
     """What several jobs will take together.
@@ -399,6 +420,7 @@ class Total:
         memory: GiB of the largest job; None: unknown.
         disk: bytes; None: unknown.
         may_end: whether some may end before their budget.
+        alike: how many are taken to be like others.
         untimed: how many jobs have no known time.
         sources, unknown: how many jobs are told by each source; how many lack each part.
     """
@@ -413,6 +435,7 @@ class Total:
     memory: float | None = None
     disk: float | None = None
     may_end: bool = False
+    alike: int = 0
     untimed: int = 0
     sources: Counter = field(default_factory=Counter)
     unknown: Counter = field(default_factory=Counter)
@@ -446,6 +469,9 @@ class Total:
         if self.untimed:
             nobody = "no such model and preset was measured on this machine, nor is it in the price list"
             lines.append(f"not known: the time of {self.untimed} of them; {nobody}")
+        if self.alike:
+            looked = "taken to be like others, and not to be finished; plan_only=true looks at each"
+            lines.append(f"{self.alike} of them are {looked}")
         missing = [f"{part} ({count})" for part, count in self.unknown.items()]
         lines += [f"not in it: {', '.join(missing)}"] if missing else []
         return [lines[0], *(f"  {line}" for line in lines[1:])]
@@ -469,6 +495,7 @@ def total(costs: Iterable[tuple[Job, Cost]], at_once: int, *, local: bool = True
         seen.add(job.folder)
         found.sources[cost.source] += 1
         found.may_end |= job.may_end
+        found.alike += job.alike
         found.unknown.update(cost.unknown)
         if cost.wall is None:
             found.untimed += 1
@@ -488,7 +515,16 @@ def joined(lanes: Sequence[Sequence[Total]], at_once: int) -> Total:
     for lane in lanes:
         heapreplace(ends, ends[0] + sum(sweep.wall for sweep in lane))
         for sweep in lane:
-            for name in ("jobs", "finished", "skipped", "processor", "training", "may_end", "untimed"):
+            for name in (
+                "jobs",
+                "finished",
+                "skipped",
+                "processor",
+                "training",
+                "may_end",
+                "alike",
+                "untimed",
+            ):
                 setattr(found, name, getattr(found, name) + getattr(sweep, name))
             for name in ("sources", "unknown"):
                 getattr(found, name).update(getattr(sweep, name))

@@ -19,6 +19,9 @@ from omegaconf import DictConfig, OmegaConf
 from forewarp.runs.cost import PRICES, Cost, Job, Total, cost_of, job_of, own_file, read_costs, spell, total
 from forewarp.runs.overrides import key_of
 
+_MOST = 12  # jobs, but for seeds, that are looked at where nobody asks for each
+_DECIDE = ("model", "preset", "budget.minutes", "budget.iterations")  # most of what a job costs
+
 
 class PlanOnly(SystemExit):
     """Ends a command that was asked for its cost alone, before any job; ``error``: why there is none."""
@@ -55,23 +58,27 @@ def tell_sweep(config: DictConfig, *, listed: bool = False) -> list[str]:
     Raises:
         ValueError, HydraException, OmegaConfBaseException: if a job is no possible one.
     """
-    costs, whole = cost_of_sweep(config)
+    costs, whole = cost_of_sweep(config, every=listed)
     lines = whole.lines()
     if costs is None:
         lines[0] += f" (those that {_target(config.hydra.sweeper)} chooses; finished ones are skipped)"
-    elif listed:
-        for job, cost in costs:
-            length = "?" if cost.wall is None else spell(cost.wall)
-            lines.append(f"  {job.state or length:>9}  {job.folder}")
-    return lines
+    return [*lines, *listing(costs)] if listed else lines
 
 
-def cost_of_sweep(config: DictConfig) -> tuple[list[tuple[Job, Cost]] | None, Total]:
+def listing(costs: Sequence[tuple[Job, Cost]] | None) -> list[str]:
+    """Write a line for each job; none where the sweeper chooses them."""
+    lengths = ["?" if cost.wall is None else spell(cost.wall) for _, cost in costs or ()]
+    return [f"  {job.state or length:>9}  {job.folder}" for (job, _), length in zip(costs or (), lengths)]
+
+
+def cost_of_sweep(config: DictConfig, *, every: bool = True) -> tuple[list[tuple[Job, Cost]] | None, Total]:
     """Estimate the jobs of a sweep and what they take together; the list is None if the sweeper chooses each
     job by the scores of earlier ones.
 
     Args:
         config: as of ``jobs_of``.
+        every: whether to look at each job and its scene, which takes about a second each; else a few jobs
+            stand for all, and scenes are not read.
 
     Raises:
         ValueError, HydraException, OmegaConfBaseException: if a job is no possible one.
@@ -79,11 +86,11 @@ def cost_of_sweep(config: DictConfig) -> tuple[list[tuple[Job, Cost]] | None, To
     own, prices = read_costs(own_file()), read_costs(PRICES)
 
     def estimated(job: DictConfig) -> tuple[Job, Cost]:
-        read = job_of(job, own)
+        read = job_of(job, own, read=every)
         return read, cost_of(read, own, prices)
 
-    local = is_local(config)
-    if _crossed(config) is None:
+    local, of_jobs = is_local(config), _crossed(config)
+    if of_jobs is None:
         with as_job(config):
             job, cost = estimated(deepcopy(config))
         count = config.hydra.sweeper.get("n_trials") or 1
@@ -91,25 +98,56 @@ def cost_of_sweep(config: DictConfig) -> tuple[list[tuple[Job, Cost]] | None, To
             (replace(job, folder=Path(f"{job.folder}-{number}"), state=""), cost) for number in range(count)
         ]
         return None, total(some, at_once(config, count), local=local)
-    costs = [estimated(job) for job in jobs_of(config)]
+    seedless = [_seedless(words) for words in of_jobs]
+    few = {*(seedless if every else _few(seedless))}
+    looked_at = [words for words, rest in zip(of_jobs, seedless) if rest in few]
+    known = {tuple(words): estimated(job) for job, words in zip(jobs_of(config, looked_at), looked_at)}
+    costs = []
+    for number, words in enumerate(of_jobs):
+        if (found := known.get(tuple(words))) is None:
+            job, cost = known[max(known, key=lambda other: len({*words} & {*other}))]
+            found = replace(job, folder=Path(f"{job.folder}-{number}"), state="", alike=True), cost
+        costs.append(found)
     return costs, total(costs, at_once(config, len(costs)), local=local)
 
 
-def jobs_of(config: DictConfig) -> Iterator[DictConfig]:
+def _seedless(words: Sequence[str]) -> tuple[str, ...]:
+    return tuple(word for word in words if key_of(word) != "seed")
+
+
+def _few(jobs: Sequence[tuple[str, ...]]) -> list[tuple[str, ...]]:
+    """Choose jobs that stand for all: one for each value of ``_DECIDE``, then for other values up to
+    ``_MOST``; all of them if these are no more.
+    """
+    jobs = list(dict.fromkeys(jobs))
+    if len(jobs) <= _MOST:
+        return jobs
+    chosen, seen = [], set()
+    for decides in (True, False):
+        for words in jobs:
+            new = {word for word in words if key_of(word) in _DECIDE or not decides} - seen
+            if not chosen or (new and (decides or len(chosen) < _MOST)):
+                chosen.append(words)
+                seen.update(words)
+    return chosen
+
+
+def jobs_of(config: DictConfig, of_jobs: Sequence[Sequence[str]] | None = None) -> Iterator[DictConfig]:
     """Compose each job of a sweep; those that differ in the seed alone are composed once.
 
     While a job is at hand it is Hydra's own (``HydraConfig``).
 
     Args:
         config: of the sweep, as ``Callback.on_multirun_start`` gets it.
+        of_jobs: overrides of the jobs to compose; None: all of the sweep.
 
     Raises:
         HydraException, OmegaConfBaseException: if a job cannot be composed.
     """
     composed, mode = {}, OmegaConf.to_container(config.hydra.overrides.hydra)  # ${..} as typed
-    for of_job in _crossed(config) or ():
+    for of_job in (_crossed(config) or ()) if of_jobs is None else of_jobs:
         seed = [override for override in of_job if key_of(override) == "seed"]
-        rest = tuple(override for override in of_job if override not in seed)
+        rest = _seedless(of_job)
         if rest not in composed:
             composed[rest] = compose(config.hydra.job.config_name, [*mode, *of_job], return_hydra_config=True)
         job = deepcopy(composed[rest])
