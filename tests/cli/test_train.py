@@ -112,10 +112,17 @@ def test_trackers_get_a_name_for_each_thing(fitted):
     last = {name: events.Scalars(name)[-1] for name in events.Tags()["scalars"]}
     expected = {f"test/{kind}/{name}": v for kind, of in content["test"].items() for name, v in of.items()}
     expected |= {"test/flow/epe_moving": content["flow"]["epe_moving"]}
-    budgeted = sum(read(fitted / stage / "done.json")["seconds"] for stage in ("coarse", "fine"))
+    stages = [read(fitted / stage / "done.json") for stage in ("coarse", "fine")]
+    assert all(
+        stage["code"]["forewarp"] and {"torch", "numpy", "python"} <= set(stage["versions"])
+        for stage in stages
+    )
+    spent = {clock: sum(stage["clocks"][clock] for stage in stages) for clock in ("wall", "processor")}
+    expected |= {f"test/seconds_training_{clock}": seconds for clock, seconds in spent.items()}
     per_image = [image["seconds"] for image in read(fitted / "per_image.json")["images"]]
-    expected |= {"test/seconds_training": budgeted, "test/seconds_image": sum(per_image) / len(per_image)}
-    expected |= {f"test/{name}": content[name] for name in ("peak_memory_bytes", "parameters")}
+    expected |= {"test/seconds_image_wall": sum(per_image) / len(per_image)}
+    expected |= {"test/peak_memory_process_bytes": max(stage["peak_memory_bytes"] for stage in stages)}
+    expected |= {"test/parameters": content["parameters"]}
     found = {name: point.value for name, point in last.items() if name.startswith("test/")}
     assert found == pytest.approx(expected, rel=1e-6)
     assert {last[name].step for name in expected} == {sum(content["steps"].values())}

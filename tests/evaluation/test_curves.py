@@ -86,8 +86,9 @@ def test_rows_of_the_held_out_views_lie_at_geometric_moments_and_at_the_end(watc
     assert float(rows[-1]["psnr"]) == pytest.approx(expected, abs=1e-3)
     logged = read_rows(folder / "csv" / "metrics.csv")
     assert [row["step"] for row in logged] == [row["step"] for row in rows]
-    for column in ("psnr", "epe_moving", "seconds"):
-        points = [float(row[f"curve/{column}"]) for row in logged]
+    names = {"psnr": "held_out/psnr", "epe_moving": "epe_moving", "seconds": "seconds_wall"}
+    for column, name in names.items():
+        points = [float(row[f"curve/{name}"]) for row in logged]
         assert points == pytest.approx([float(row[column]) for row in rows], rel=1e-4)
 
 
@@ -129,6 +130,8 @@ def test_seconds_add_up_over_stages_and_a_stage_not_noted_gets_no_second_last_ro
 @pytest.mark.parametrize("views", [0, 1])
 def test_a_run_with_validation_views_has_a_curve_and_no_other(tmp_path, views):
     run(tmp_path, held_out=0, scene=lambda: replace(scene_with_truth(views), truth=None)).fit()
+    logged = {name for row in read_rows(tmp_path / "csv" / "metrics.csv") for name in row}
+    assert logged == ({"curve/val/psnr", "curve/seconds_wall", "step"} if views else set())
     assert not views or steps(tmp_path) == EXPECTED
     rows = read_rows(tmp_path / "accuracy_time.csv")
     assert [row["epe_moving"] for row in rows] == [""] * 3 * views  # there is no truth

@@ -39,8 +39,9 @@ class AccuracyCurve(lightning.Callback):
     A row holds ``seconds`` of training over all stages (the clock stands still while a row is made),
     ``stage``, ``step`` of the stage, ``psnr`` (dB, mean over the views, from the same random pixels of each),
     ``epe_moving`` (world units; empty if the scene has no true trajectories) and the method's ``size``
-    (voxels, particles, parameters). The loggers get ``curve/psnr``,
-    ``curve/epe_moving`` and ``curve/seconds``. A resumed run continues its rows.
+    (voxels, particles, parameters). The loggers get ``curve/held_out/psnr`` or ``curve/val/psnr``,
+    ``curve/epe_moving``, and ``curve/seconds_wall`` or ``curve/seconds_processor``, of the clock that the
+    budget counts by. A resumed run continues its rows.
 
     Set ``target`` for the last stage, to end it once the rows say so; they are then made more often.
 
@@ -129,7 +130,10 @@ class AccuracyCurve(lightning.Callback):
                 writer = csv.DictWriter(file, COLUMNS, restval="")
                 writer.writeheader()
                 writer.writerows(self._rows)
-            curve = {f"curve/{name}": value for name, value in scores.items()} | {"curve/seconds": seconds}
+            views = "held_out" if trainer.datamodule.scene.held else "val"
+            names = {"psnr": f"{views}/psnr", "epe_moving": "epe_moving"}
+            curve = {f"curve/{names[name]}": value for name, value in scores.items()}
+            curve[f"curve/seconds_{module.clock.kind}"] = seconds
             module.trackers.log(curve, module.global_step)
             if self.target.is_set:
                 self._check_target(module)

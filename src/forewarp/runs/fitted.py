@@ -298,7 +298,8 @@ def measure_run(run: Run, module: DynamicSceneModule, config: DictConfig) -> dic
 
 def log_scores(run: Run, metrics: dict) -> None:
     """Log what ``metrics.json`` says of a run to its loggers; see ``scores_to_log``."""
-    run.loggers.log_scores(scores_to_log(metrics), sum(done["steps"] for done in run.finished().values()))
+    scores = scores_to_log(metrics, "gpu" if run.device.type == "cuda" else "process")
+    run.loggers.log_scores(scores, sum(done["steps"] for done in run.finished().values()))
 
 
 def log_film(run: Run, module: DynamicSceneModule, metrics: dict) -> None:
@@ -321,17 +322,22 @@ def log_film(run: Run, module: DynamicSceneModule, metrics: dict) -> None:
     run.loggers.log_film("film/test", file, sum(done["steps"] for done in run.finished().values()))
 
 
-def scores_to_log(metrics: dict) -> dict[str, float]:
+def scores_to_log(metrics: dict, memory_of: str) -> dict[str, float]:
     """Name the scores of ``metrics.json`` for trackers: ``test/space/psnr``, and what they cost.
 
+    ``memory_of`` is whose memory was measured, ``gpu`` or ``process``.
     ``docs/sweeps.md`` says what each name means, and in which unit. What a run has not is left out.
     """
     kinds, seconds = metrics["test"].items(), metrics["seconds"]
     scores = {f"test/{kind}/{name}": score for kind, of in kinds for name, score in of.items()}
     scores |= {"test/flow/epe_moving": metrics.get("flow", {}).get("epe_moving")}
     scores |= {"test/keypoints/pck_t": metrics.get("keypoints", {}).get("pck_t")}
-    scores |= {"test/seconds_training": seconds["train"], "test/seconds_image": seconds["render_per_frame"]}
-    scores |= {f"test/{name}": metrics[name] for name in ("peak_memory_bytes", "parameters")}
+    scores |= {f"test/seconds_training_{clock}": spent for clock, spent in metrics["clocks"].items()}
+    scores |= {
+        "test/seconds_image_wall": seconds["render_per_frame"],
+        "test/parameters": metrics["parameters"],
+    }
+    scores |= {f"test/peak_memory_{memory_of}_bytes": metrics["peak_memory_bytes"]}
     return {name: float(score) for name, score in scores.items() if score is not None}
 
 
