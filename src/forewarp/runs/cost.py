@@ -18,6 +18,7 @@ from dataclasses import dataclass, field, fields
 from datetime import date
 from hashlib import sha256
 from heapq import heapreplace
+from itertools import chain
 from pathlib import Path
 from statistics import median
 from time import perf_counter, process_time
@@ -485,52 +486,33 @@ def total(costs: Iterable[tuple[Job, Cost]], at_once: int, *, local: bool = True
         at_once: jobs at the same time.
         local: whether they share the cores of this machine.
     """
-    found, ends, seen = Total(at_once=at_once), [0.0] * at_once, set()
+    each, seen = [], set()
     for job, cost in costs:
-        found.jobs += 1
         if job.state or job.folder in seen:
-            found.skipped += job.state == "skipped"
-            found.finished += job.state != "skipped"
+            is_skipped = job.state == "skipped"
+            each.append(Total(1, finished=not is_skipped, skipped=is_skipped))
             continue
         seen.add(job.folder)
-        found.sources[cost.source] += 1
-        found.may_end |= job.may_end
-        found.alike += job.alike
-        found.unknown.update(cost.unknown)
-        if cost.wall is None:
-            found.untimed += 1
-        else:
-            heapreplace(ends, ends[0] + cost.wall)  # whoever is free first takes it
-            found.processor += cost.processor
-            found.training += cost.training
-        found.memory = max((m for m in (found.memory, cost.memory) if m is not None), default=None)
-        found.disk = found.disk if cost.disk is None else (found.disk or 0.0) + cost.disk
-    found.wall = max(max(ends), found.processor / (os.cpu_count() or 1) if local else 0.0)
-    return found
+        times = {name: getattr(cost, name) or 0.0 for name in ("wall", "processor", "training")}
+        held = {"memory": cost.memory, "disk": cost.disk, "unknown": Counter(cost.unknown)}
+        told = {"may_end": job.may_end, "alike": job.alike, "untimed": cost.wall is None}
+        each.append(Total(1, sources=Counter([cost.source]), **times, **held, **told))
+    return joined([[one] for one in each], at_once, local=local)
 
 
-def joined(lanes: Sequence[Sequence[Total]], at_once: int) -> Total:
+def joined(lanes: Sequence[Sequence[Total]], at_once: int, *, local: bool = True) -> Total:
     """Add up lanes of sweeps, ``at_once`` lanes at a time, the sweeps of a lane one after another."""
     found, ends = Total(at_once=max(at_once, 1)), [0.0] * max(at_once, 1)
     for lane in lanes:
-        heapreplace(ends, ends[0] + sum(sweep.wall for sweep in lane))
-        for sweep in lane:
-            for name in (
-                "jobs",
-                "finished",
-                "skipped",
-                "processor",
-                "training",
-                "may_end",
-                "alike",
-                "untimed",
-            ):
-                setattr(found, name, getattr(found, name) + getattr(sweep, name))
-            for name in ("sources", "unknown"):
-                getattr(found, name).update(getattr(sweep, name))
-            found.memory = max((m for m in (found.memory, sweep.memory) if m is not None), default=None)
-            found.disk = (found.disk or 0.0) + sweep.disk if sweep.disk is not None else found.disk
-    found.wall = max(max(ends), found.processor / (os.cpu_count() or 1))
+        heapreplace(ends, ends[0] + sum(sweep.wall for sweep in lane))  # whoever is free first takes it
+    for sweep in chain(*lanes):
+        for name in ("jobs", "finished", "skipped", "processor", "training", "may_end", "alike", "untimed"):
+            setattr(found, name, getattr(found, name) + getattr(sweep, name))
+        for name in ("sources", "unknown"):
+            getattr(found, name).update(getattr(sweep, name))
+        found.memory = max((m for m in (found.memory, sweep.memory) if m is not None), default=None)
+        found.disk = (found.disk or 0.0) + sweep.disk if sweep.disk is not None else found.disk
+    found.wall = max(max(ends), found.processor / (os.cpu_count() or 1) if local else 0.0)
     return found
 
 
