@@ -14,10 +14,10 @@ from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
 
+import yaml
 from filelock import FileLock
 from lightning.pytorch.loggers import CSVLogger, Logger, MLFlowLogger, TensorBoardLogger, WandbLogger
 from lightning.pytorch.loggers.csv_logs import ExperimentWriter
-from omegaconf import OmegaConf
 from tensorboard.compat.proto.summary_pb2 import Summary
 from torch import Tensor
 
@@ -279,8 +279,8 @@ def _last_part(path: re.Match) -> str:
 
 
 def _log_config(logger: Logger, file: Path, step: int) -> None:
-    content = OmegaConf.to_container(OmegaConf.create(read_text(file, MOST_CONFIG)))
-    _log_text(logger, "config", OmegaConf.to_yaml(redacted(content)), step)
+    content = redacted(yaml.safe_load(read_text(file, MOST_CONFIG)))
+    _log_text(logger, "config", yaml.safe_dump(content, sort_keys=False, allow_unicode=True), step)
 
 
 def _log_text(logger: Logger, title: str, text: str, step: int) -> None:
