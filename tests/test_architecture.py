@@ -1,6 +1,7 @@
 """Who imports whom (docs/architecture.md)."""
 
 import ast
+import re
 from pathlib import Path
 
 import pytest
@@ -159,3 +160,8 @@ def of(part):
 )
 def test_the_checks_themselves(check, line, allowed):
     assert (check(line) == []) is allowed
+
+
+def test_no_private_function_of_torch_is_called():
+    for file in SOURCE.rglob("*.py"):
+        assert not re.findall(r"\btorch\.(?:\w+\.)*_[a-z]\w*", file.read_text()), file

@@ -11,7 +11,7 @@ from collections import defaultdict
 from collections.abc import Mapping, Sequence
 
 import lightning
-import torch
+from torch.nn.utils import get_total_norm
 
 from forewarp.methods.method import check_least
 from forewarp.progress import ProgressLine, time_text
@@ -140,5 +140,5 @@ def gradient_norms(groups: Sequence[Mapping]) -> dict[str, float]:
     found = {}
     for group in groups:
         if gradients := [p.grad for p in group["params"] if p.grad is not None]:
-            found[group["name"]] = float(torch.stack(torch._foreach_norm(gradients)).norm())
+            found[group["name"]] = float(get_total_norm(gradients))
     return found
