@@ -17,6 +17,7 @@ import torch
 import yaml
 
 from forewarp import load
+from forewarp.provenance import source_of
 from forewarp.scene.camera import look_at
 from tests.support.commands import call
 
@@ -125,6 +126,7 @@ def originals(work, found):
             done = call("train", *words, f"run={work / name}")
             assert done.status == 0, done.err
             patch.syspath_prepend(str(work / "site"))
+            source_of.cache_clear()  # from now on it is installed
     forget_mine()
     return work
 
