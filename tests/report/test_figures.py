@@ -153,6 +153,8 @@ def test_sizes_under_other_conditions_are_other_lines():
             "psnr": psnr,
             "config": config,
             "ablation": f"resolution {side}",
+            "setting": f"stage.fine.num_voxels={side}",  # as typed by the sweep
+            "words": {"stage.fine.num_voxels": f"num_voxels={side}"},
         }
 
     lines = by_side(run(side, held_out, side + held_out) for side in (16, 32) for held_out in (4, 8))

@@ -477,8 +477,9 @@ def by_side(rows: Iterable[Row]) -> dict[str, dict[int, Runs]]:
     runs, lines = Runs(), {}
     for row in (row for row in rows if row["psnr"] is not None):
         voxels = row["config"]["stage"]["fine"]["num_voxels"][-1][1]
-        runs.append(row | {"side": round(voxels ** (1 / 3))})
-    shared = [name for name in (*SAME, "setting") if name != "ablation"]  # which has the size
+        other = " ".join(word for key, word in row["words"].items() if not key.endswith("num_voxels"))
+        runs.append(row | {"side": round(voxels ** (1 / 3)), "setting": other})
+    shared = [name for name in (*SAME, "setting") if name != "ablation"]  # which may name the size
     groups = [group for group in runs.by(*shared).values() if len(group.by("side")) > 1]
     for group in groups:
         row, others = group[0], [other[0] for other in groups]
