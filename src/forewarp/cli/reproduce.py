@@ -87,6 +87,9 @@ FEW = {
     "data.synthesis.motions=[lift_tilt,drive]",
 }
 FEW["drive"] = FEW["lego_complete"]  # of one folder
+FEW_VOXELS = "modules.num_voxels=[[0,4096]] preset.rays=256"
+FEW_IN_ROOM = "stage.coarse.num_voxels=[[0,8000]] stage.coarse.background_num_voxels=[[0,1000]] "
+FEW_IN_ROOM += "stage.fine.background_num_voxels=[[0,8000]]"
 TINY = shlex.split(
     "data.scene=tiny paths.data=runs/bench-gpu data.synthesis.size=32 data.synthesis.frames=8 "
     "data.synthesis.test_views=[1,1,1] preset.rays=64 preset.inpainter_width=16 data.held_out=2 "
@@ -258,10 +261,12 @@ def _counterparts(sweeps: str, base: Sweep, keys: Keys) -> list[list[Sweep]]:
 
     def of_pair(sweep: str, data: str) -> Sweep:
         more = _models(keys.methods, sweep)
-        if data == "hypernerf" and (sweeps == "ablations" or (keys.small and sweep in OF_FORWARD)):
+        if data == "hypernerf" and sweeps == "ablations":
             more += ROOM
         if keys.small and sweeps == "all":
             more += [*shlex.split(FEW[data]), "paths.data=runs/data", "callbacks.accuracy=null"]
+            more += shlex.split(FEW_VOXELS) * (sweep in OF_FORWARD)
+            more += shlex.split(FEW_IN_ROOM) * (sweep in OF_FORWARD and data == "hypernerf")
         return [*base, f"sweeps={sweep}", f"scene=counterpart_{data}", *more]
 
     lanes = [[pair.split(":") for pair in lane.split()] for lane in LANES]
