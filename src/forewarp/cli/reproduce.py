@@ -64,11 +64,10 @@ KEYS = dict.fromkeys([*KEYS, "launcher", "more", "small", "plan_only"], "") | {"
 TABLES = ["dnerf", "hypernerf", "nhr", "lego_complete"]
 ABLATIONS = ["ablation_modules", "ablation_losses"]
 OF_FORWARD = [*ABLATIONS, "resolution"]
-# Sweeps and the counterparts they run on without data, in two lanes of about the same length, a core each.
-LANES = (
-    "methods:dnerf nhr:nhr ablation_losses:dnerf ablation_modules:dnerf",
-    "methods:hypernerf lego_complete:lego_complete ablation_modules:hypernerf "
-    "ablation_modules:lego_complete resolution:hypernerf flow:drive",
+# Sweeps and the counterparts they run on without data; a core that is free takes the next, so long ones first.
+COUNTERPARTS = (
+    "methods:hypernerf methods:dnerf ablation_modules:hypernerf resolution:hypernerf ablation_losses:dnerf "
+    "flow:drive nhr:nhr lego_complete:lego_complete ablation_modules:dnerf ablation_modules:lego_complete"
 )
 # The voxel networks come with the fine stage, to which the demo's numbers give too little of the training; on
 # fewer rays and voxels it makes enough steps within minutes.
@@ -253,7 +252,7 @@ def _models(methods: str, sweep: str) -> Sweep:
 
 
 def _counterparts(sweeps: str, base: Sweep, keys: Keys) -> list[list[Sweep]]:
-    """Return the sweeps of counterparts in two lanes: the tables', those of ``ablations``, or ``all``, which
+    """Return the sweeps of counterparts, a lane each: the tables', those of ``ablations``, or ``all``, which
     together draw every figure.
     """
     left_out = {"": OF_FORWARD, "ablations": [*TABLES, "methods", "resolution", "flow"], "all": []}
@@ -269,8 +268,8 @@ def _counterparts(sweeps: str, base: Sweep, keys: Keys) -> list[list[Sweep]]:
             more += shlex.split(FEW_IN_ROOM) * (sweep in OF_FORWARD and data == "hypernerf")
         return [*base, f"sweeps={sweep}", f"scene=counterpart_{data}", *more]
 
-    lanes = [[pair.split(":") for pair in lane.split()] for lane in LANES]
-    return [[of_pair(*pair) for pair in lane if pair[0] not in left_out[sweeps]] for lane in lanes]
+    pairs = [pair.split(":") for pair in COUNTERPARTS.split()]
+    return [[of_pair(*pair)] for pair in pairs if pair[0] not in left_out[sweeps]]
 
 
 def ablations(keys: Keys) -> Job:
