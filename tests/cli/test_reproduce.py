@@ -21,7 +21,7 @@ def test_tables_without_data_fit_all_methods_on_two_counterparts():
     sweeps, ((*_, out, curves),) = planned("tables")
     assert (out, curves) == ("out=runs/paper/results", "curves=docs/results")
     common = {"preset=demo", "budget.minutes=1", "seeds=1", "threads=1", "budget.clock=processor"}
-    names = "methods:dnerf nhr:nhr methods:hypernerf lego_complete:lego_complete flow:drive"
+    names = "methods:hypernerf methods:dnerf flow:drive nhr:nhr lego_complete:lego_complete"
     pairs = [pair.split(":") for pair in names.split()]
     for sweep, (name, data) in zip(sweeps, pairs, strict=True):
         assert sweep > common | {f"sweeps={name}", f"scene=counterpart_{data}"}

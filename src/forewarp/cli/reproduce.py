@@ -64,7 +64,7 @@ KEYS = dict.fromkeys([*KEYS, "launcher", "more", "small", "plan_only"], "") | {"
 TABLES = ["dnerf", "hypernerf", "nhr", "lego_complete"]
 ABLATIONS = ["ablation_modules", "ablation_losses"]
 OF_FORWARD = [*ABLATIONS, "resolution"]
-# Sweeps and the counterparts they run on without data; a core that is free takes the next, so long ones first.
+# Sweeps and the counterparts they run on without data: long ones first, as a free core takes the next.
 COUNTERPARTS = (
     "methods:hypernerf methods:dnerf ablation_modules:hypernerf resolution:hypernerf ablation_losses:dnerf "
     "flow:drive nhr:nhr lego_complete:lego_complete ablation_modules:dnerf ablation_modules:lego_complete"
