@@ -229,10 +229,10 @@ def test_a_cost_that_cannot_be_told_ends_a_command_that_asks_for_it_alone(
     def fails(*_, **__):
         raise RuntimeError("no\nidea")
 
-    monkeypatch.setattr(jobs, "tell_sweep", fails)
+    monkeypatch.setattr(jobs, "estimate_lines", fails)
     assert refused(*words, "seeds=2") == "RuntimeError: no; idea"
     assert not [*in_tmp.iterdir()]
-    jobs.TellCost().on_multirun_start(OmegaConf.create({"plan_only": False}))  # goes on
+    jobs.ReportCost().on_multirun_start(OmegaConf.create({"plan_only": False}))  # goes on
     assert capsys.readouterr().out == "no estimate: no idea\n"
 
 
@@ -255,5 +255,5 @@ def test_a_sweep_says_first_what_it_costs_by_its_own_jobs(ok, in_tmp, monkeypatc
     assert all(float(row["views"]) == 2 and float(row["disk"]) > 0 for row in rows)
     first, *lines = ok(*words, "seeds=3", "plan_only=true").out.splitlines()
     assert first == "3 jobs: 2 finished before, 1 to do"
-    assert "  by runs of this machine (1)" in lines
+    assert "  estimated from runs of this machine (1)" in lines
     assert [line.split()[0] for line in lines[-3:-1]] == ["finished"] * 2

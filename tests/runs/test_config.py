@@ -112,7 +112,7 @@ def test_every_target_of_ours_is_trusted():
     places = {name: [key for key in HOMES if is_read(target(name, key))] for name in named}
     assert [name for name, keys in places.items() if not keys] == []
     assert places["forewarp.evaluation.curves.AccuracyCurve"] == ["callbacks"]
-    assert not any(is_read(target("forewarp.runs.jobs.TellCost", key)) for key in (*HOMES, "hydra"))
+    assert not any(is_read(target("forewarp.runs.jobs.ReportCost", key)) for key in (*HOMES, "hydra"))
     assert places["forewarp.synth.module.SyntheticDataModule"] == ["data"]
 
 

@@ -97,8 +97,8 @@ def test_what_nobody_knows_is_said():
     assert cost_of(job(iterations=9, like=gpu), [MEASURED], [PRICE]).wall is None
     first, *lines = total([(job(iterations=1000), found)], 1).lines()
     assert first == "1 job"
-    nobody = "no such model and preset was measured on this machine, nor is it in the price list"
-    assert lines[0] == f"  not known: the time of 1 of them; {nobody}"
+    absent = "neither this machine nor the price list has times of this model and preset"
+    assert lines[0] == f"  unknown: the time of 1 of them; {absent}"
 
 
 def test_jobs_add_up_over_workers_and_those_done_are_left_out(monkeypatch):
@@ -114,7 +114,7 @@ def test_jobs_add_up_over_workers_and_those_done_are_left_out(monkeypatch):
         "7 jobs: 2 finished before, 1 without a scene, 4 to do; 2 at a time",
         "  about 6.5 min of wall clock on an idle machine, 11.7 min of processor, 11.0 min of it training",
         "  0.5 GiB of memory a job, 8 MB of disk",
-        "  by runs of this machine (4)",
+        "  estimated from runs of this machine (4)",
     ]
     assert total(costs, 4).wall == pytest.approx(350.0)  # two cores, 700 s of processor
     assert total(costs, 4, local=False).wall == pytest.approx(310.0)

@@ -62,7 +62,7 @@ def test_a_sweep_is_told_by_its_jobs_in_a_few_lines_and_listed(sweep, monkeypatc
     assert [job.state for job, _ in costs] == ["", ""]
     assert {(job.like.views, job.like.pixels) for job, _ in costs} == {(30, 10_000)}  # to be written
     (done / "metrics.json").write_text("{}")
-    lines = jobs.tell_sweep(config, listed=True)
+    lines = jobs.estimate_lines(config, listed=True)
     assert lines[0] == "2 jobs: 1 finished before, 1 to do"
     assert whole.training == pytest.approx(60.0)
     assert lines[-1] == f"   finished  {done}"
@@ -80,7 +80,7 @@ def test_a_few_jobs_stand_for_many_unless_each_is_asked_for(sweep, monkeypatch):
     assert (len(composed), len(read), len(costs), len({job.folder for job, _ in costs})) == (3, 0, 20, 20)
     assert sorted(job.like.model for job, _ in costs) == ["forward"] * 10 + ["particles"] * 10
     assert (whole.alike, whole.training) == (14, pytest.approx(20 * 30.0))
-    assert any(line.startswith("  14 of them are taken to be like others") for line in whole.lines())
+    assert any(line.startswith("  14 of them are assumed to be unfinished") for line in whole.lines())
     composed.clear()
     assert cost_of_sweep(sweep(*SMALL, "data.held_out=0,1,2,3"))[1].alike == 0
     assert (len(composed), len(read)) == (4, 4)
@@ -92,7 +92,7 @@ def test_a_search_has_as_many_jobs_as_it_is_given(sweep):
         config.hydra.sweeper = {"_target_": "hydra_plugins.optuna.Optuna", "n_trials": 5, "n_jobs": 1}
     costs, whole = cost_of_sweep(config)
     assert (costs, whole.jobs, whole.training) == (None, 5, pytest.approx(150.0))
-    assert "chooses; finished ones are skipped" in jobs.tell_sweep(config)[0]
+    assert "; finished jobs are skipped" in jobs.estimate_lines(config)[0]
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""Say what jobs will cost before they run, from measured ones: of this machine, else of the price list.
+"""Estimate the cost of jobs before they run, from jobs measured on this machine, else from the price list.
 
 ``prices.csv`` is the price list, written from the tables in ``docs/results`` by ``python -m
 tests.bench.prices``. Each finished job of this machine adds a row of the same columns to ``own_file()``.
@@ -38,7 +38,7 @@ _KEPT = 1000  # rows of the user's file
 _OF_TRAINING = ("seed", "held_out", "train_views", "rays", "background")
 _views: dict[str, tuple[int | None, int | None]] = {}  # of each scene that was read
 _FEW = 50  # steps
-_ALIKE = 3  # jobs most like one, whose median it is told by
+_ALIKE = 3  # most similar jobs, whose median is the estimate
 
 
 @dataclass(frozen=True)
@@ -423,7 +423,7 @@ class Total:
         may_end: whether some may end before their budget.
         alike: how many are taken to be like others.
         untimed: how many jobs have no known time.
-        sources, unknown: how many jobs are told by each source; how many lack each part.
+        sources, unknown: how many jobs are estimated from each source; how many lack each part.
     """
 
     jobs: int = 0
@@ -447,7 +447,7 @@ class Total:
         return self.jobs - self.finished - self.skipped
 
     def lines(self) -> list[str]:
-        """Say it in a few lines."""
+        """Return the estimate as a few lines of text."""
         states = {"finished before": self.finished, "without a scene": self.skipped}
         states = [f"{count} {state}" for state, count in states.items() if count]
         first = f"{self.jobs} job{'s' * (self.jobs != 1)}"
@@ -466,15 +466,15 @@ class Total:
         held += [] if self.disk is None else [f"{self.disk / 1e6:.2g} MB of disk"]
         lines += [", ".join(held)] if held else []
         told = [f"{source} ({count})" for source, count in self.sources.items() if source]
-        lines += [f"by runs of {'; of '.join(told)}"] if told else []
+        lines += [f"estimated from runs of {'; of '.join(told)}"] if told else []
         if self.untimed:
-            nobody = "no such model and preset was measured on this machine, nor is it in the price list"
-            lines.append(f"not known: the time of {self.untimed} of them; {nobody}")
+            absent = "neither this machine nor the price list has times of this model and preset"
+            lines.append(f"unknown: the time of {self.untimed} of them; {absent}")
         if self.alike:
-            looked = "taken to be like others, and not to be finished; plan_only=true looks at each"
+            looked = "assumed to be unfinished and to cost what similar jobs do; plan_only=true checks each"
             lines.append(f"{self.alike} of them are {looked}")
         missing = [f"{part} ({count})" for part, count in self.unknown.items()]
-        lines += [f"not in it: {', '.join(missing)}"] if missing else []
+        lines += [f"not included: {', '.join(missing)}"] if missing else []
         return [lines[0], *(f"  {line}" for line in lines[1:])]
 
 

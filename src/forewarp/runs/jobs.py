@@ -31,14 +31,14 @@ class PlanOnly(SystemExit):
         self.error = error
 
 
-class TellCost(Callback):
-    """Say before a sweep what its jobs will cost; with ``plan_only`` list them, and end there."""
+class ReportCost(Callback):
+    """Print before a sweep what its jobs will cost; with ``plan_only`` list them, and end there."""
 
     def on_multirun_start(self, config: DictConfig, **_) -> None:
         """Print it; where that fails say so, and the sweep goes on: it refuses what is wrong with itself."""
         failed = None
         try:
-            print(*tell_sweep(config, listed=config.plan_only), sep="\n", flush=True)
+            print(*estimate_lines(config, listed=config.plan_only), sep="\n", flush=True)
         except Exception as error:
             failed = error
             if not config.plan_only:
@@ -48,8 +48,8 @@ class TellCost(Callback):
             raise PlanOnly(failed)
 
 
-def tell_sweep(config: DictConfig, *, listed: bool = False) -> list[str]:
-    """Say in lines what a sweep will cost, with ``listed`` also what each of its jobs will.
+def estimate_lines(config: DictConfig, *, listed: bool = False) -> list[str]:
+    """Return as lines of text what a sweep will cost; with ``listed`` a line for each job as well.
 
     Args:
         config: as of ``jobs_of``.
@@ -61,7 +61,7 @@ def tell_sweep(config: DictConfig, *, listed: bool = False) -> list[str]:
     costs, whole = cost_of_sweep(config, every=listed)
     lines = whole.lines()
     if costs is None:
-        lines[0] += f" (those that {_target(config.hydra.sweeper)} chooses; finished ones are skipped)"
+        lines[0] += f" (chosen by {_target(config.hydra.sweeper)}; finished jobs are skipped)"
     return [*lines, *listing(costs)] if listed else lines
 
 
