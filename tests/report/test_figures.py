@@ -101,7 +101,7 @@ def test_details_stand_below_each_run_and_are_boxed_on_the_truth(tmp_path, monke
     draw_details(tmp_path / "x.png", {name: runs[name] for name in ("good", "bad")}, depth=True)
     (axes,) = seen
     assert [axis.get_title() for axis in axes] == ["truth", "good", "bad"]
-    assert [axis.get_xlabel() for axis in axes] == ["t/mid, time 0.40", "40.00 dB", "20.50 dB"]
+    assert [axis.get_xlabel() for axis in axes] == ["t/mid\ntime 0.40", "40.00 dB", "20.50 dB"]
     tiles = [np.asarray(axis.images[0].get_array()) for axis in axes]
     detail = slice(40 + GAP, 40 + GAP + 40)  # 8 x 12 pixels, 60 wide
     assert np.allclose(tiles[2][detail], 250 / 255)

@@ -26,7 +26,7 @@ STEPS = {
     "conv3d": "convolution",
     "linear": "convolution",
     "relu": "ReLU",
-    "cat": "joining",
+    "cat": "concatenation",
 }
 STEPS |= {"max_pool3d": "max pooling", "interpolate": "interpolation"}  # of networks, in words
 
@@ -322,13 +322,13 @@ def draw_details(
         white = np.ones((GAP, width, 3))
         tiles[name] = np.concatenate([row for part in tile for row in (white, part)][1:])
     times = {image["name"]: image["time"] for image in runs[first]["images"]}
-    below = {"truth": view + (f", time {times[view]:.2f}" if view in times else "")}
+    below = {"truth": view + (f"\ntime {times[view]:.2f}" if view in times else "")}
     for name, row in runs.items():
         psnr = [image["scores"]["psnr"] for image in row["images"] if image["name"] == view]
         below[name] = f"{psnr[0]:.2f} dB" if psnr else ""
     across = min(len(tiles), ACROSS)
     down, wide = -(-len(tiles) // across), WIDEST / across / DOTS
-    high = wide * next(iter(tiles.values())).shape[0] / width + 2 * TITLE / DOTS
+    high = wide * next(iter(tiles.values())).shape[0] / width + 3 * TITLE / DOTS
     figure, axes = figure_of(down, across, (across * wide, down * high))
     figure.get_layout_engine().set(w_pad=0.02, h_pad=0.02, wspace=0, hspace=0)
     for axis in axes.flat[len(tiles) :]:
@@ -383,7 +383,7 @@ def draw_network(path: Path, steps: Sequence[Mapping]) -> Path:
     """Draw a network from the list of its steps that a run's ``networks.json`` has (see ``fields.outline``).
 
     A box is a volume, the lower the smaller, and as wide as it has channels (the number above). An arrow is
-    one or several steps, a dashed one goes to where volumes are joined. N voxels along a side are given.
+    one or several steps, a dashed one a skip connection. N voxels along a side are given.
 
     Args:
         path: file of the picture.
@@ -424,8 +424,8 @@ def draw_network(path: Path, steps: Sequence[Mapping]) -> Path:
     for name, color in styles.items():
         axis.plot([], [], color=color, linewidth=2, label=name)
     if any(len(step["from"]) > 1 for step in steps):
-        axis.plot([], [], color="0.55", linestyle="--", label="to what it is joined with")
-    axis.set(xlim=(-1.1, rights[-1] + 0.1), ylim=(-deep - 0.4, -top + 0.6))
+        axis.plot([], [], color="0.55", linestyle="--", label="skip connection")
+    axis.set(xlim=(-1.1, rights[-1] + 0.4), ylim=(-deep - 0.4, -top + 0.6))
     axis.set_axis_off()
     figure.legend(loc="outside lower center", ncols=3, fontsize=8, frameon=False)
     return save(figure, path, colors=64)
