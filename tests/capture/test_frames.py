@@ -464,3 +464,17 @@ def test_missing_images_leave_a_gap_in_time(tmp_path):
     frames = taken(tmp_path, folder)
     assert list(frames.times.values()) == pytest.approx([0, 1 / 9, 3 / 9, 1])
     assert frames.assumed.endswith("times: taken from the numbers in the images' names, 0 to 9")
+
+
+def test_times_follow_gaps_in_names_or_say_that_they_do_not(tmp_path):
+    folder = tmp_path / "p"
+    folder.mkdir()
+    for name in ("f_0000", "f_0001", "f_0031"):
+        Image.new("RGB", (64, 48)).save(folder / f"{name}.png")
+    assert list(taken(tmp_path, folder).times.values()) == pytest.approx([0, 1 / 31, 1])
+    for name in ("f_0032", "f_0033", "f_0034 (1)"):
+        Image.new("RGB", (64, 48)).save(folder / f"{name}.png")
+    (tmp_path / "again").mkdir()
+    frames = taken(tmp_path / "again", folder)
+    assert list(frames.times.values()) == list(range(6))
+    assert "so gaps are lost (expected names of one form, as 'f_0000', but got 'f_0034 (1)'" in frames.assumed

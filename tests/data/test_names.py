@@ -23,7 +23,7 @@ def in_groups(form: str, firsts, lasts) -> list[str]:
         (["20231115_170425", "20231115_170430"], [0, 5]),
         ([f"41048190_{s}" for s in ("3415.043", "3415.918", "3416.418")], [0, 0.875, 1.375]),
         (["1700000000_500000000", "1700000001_000000000"], [0, 0.5]),
-        (["DSC_9998", "DSC_9999", "DSC_0001", "DSC_0003"], [0, 1, 3, 5]),  # a counter that began anew
+        (["DSC_9998", "DSC_9999", "DSC_0001", "DSC_0003"], [0, 1, 2, 4]),  # a counter that began anew at 1
         ([f"clip{c}_{f:04d}" for c, f in ((1, 7), (1, 8), (2, 9), (2, 12))], [0, 1, 2, 5]),  # counted through
         (in_groups("cam{}/DSC_{:04d}", range(6), range(1, 5)), [0, 1, 2, 3] * 6),
         (in_groups("cam{}_frame{:02d}", range(2), range(3)), [0, 1, 2] * 2),
@@ -35,11 +35,16 @@ def in_groups(form: str, firsts, lasts) -> list[str]:
         (["20240501_1045", "20240501_1115"], [0, 1800]),
         (["DJI_20240501120000_0001", "DJI_20240501124400_0002", "DJI_20240501124401_0003"], [0, 2640, 2641]),
         (["vlcsnap-00h00m09s200", "vlcsnap-00h01m02s300"], [0, 53100]),
-        (["DJI_0998", "DJI_0999", "DJI_0001", "DJI_0002"], [0, 1, 3, 4]),
+        (["DJI_0998", "DJI_0999", "DJI_0001", "DJI_0002"], [0, 1, 2, 3]),
         (["t_0.0", "t_0.9", "t_1.5"], [0, 0.9, 1.5]),
         ([f"{serial}/16123456780{t}" for serial in (22139905, 33) for t in ("00", "33")], [0, 33] * 2),
         ([f"IMG_{i:04d}_2024010112000{i}" for i in range(3)], [0, 1, 2]),
         (["train/0001", "train/0005", "test/0003"], [0, 4, 2]),
+        ([f"{i:06d}" for i in range(10000, 10400, 50)], range(0, 400, 50)),  # a counter, no clock
+        (["2024-05-30", "2024-05-31", "2024-06-02"], [0, 86400, 259200]),
+        (["sky_20240531", "sky_20240601", "sky_20240603"], [0, 86400, 259200]),
+        ([f"10-{m:02d}-{s:02d}" for m, s in ((5, 58), (5, 59), (6, 1), (6, 2))], [0, 1, 3, 4]),
+        (["01.05.2024 10.30.59", "01.05.2024 10.31.00", "01.05.2024 10.31.02"], [0, 1, 3]),
     ],
 )  # fmt: skip
 def test_numbers_that_names_say_in_one_way(names, frames):
@@ -49,27 +54,47 @@ def test_numbers_that_names_say_in_one_way(names, frames):
 
 @pytest.mark.parametrize("form", ["{}_{:03d}", "s{}/{:03d}", "cam_{}_{:03d}", "{}-{:03d}"])
 def test_where_cameras_are_tells_a_rig(form):
-    found = read_names(in_groups(form, range(3), range(4)), "t.json", centers=RIG)
+    found = read_names(in_groups(form, range(3), range(4)), "t.json", views=RIG)
     assert found.frames == [0, 1, 2, 3] * 3
     assert len({*found.cameras}) == 3
 
 
 @pytest.mark.parametrize("form", ["{1:06d}/{0}", "img/{1}/img_{0:04d}", "a_{1:05d}_{0}"])
 def test_where_cameras_are_tells_which_number_is_theirs(form):
-    found = read_names(in_groups(form, range(3), range(4)), "t.json", centers=RIG)
+    found = read_names(in_groups(form, range(3), range(4)), "t.json", views=RIG)
     assert found.frames == [0, 1, 2, 3] * 3
 
 
 @pytest.mark.parametrize("form", ["{}_{:03d}", "part{}/{:03d}", "1_{}_{:03d}"])
 def test_where_cameras_are_tells_one_film(form):
-    found = read_names(in_groups(form, range(3), range(4)), "t.json", centers=PATH)
+    found = read_names(in_groups(form, range(3), range(4)), "t.json", views=PATH)
     assert found.frames == list(range(12))
     assert found.cameras is None
+
+
+def test_gaps_and_fractions_of_one_film_stay():
+    parts = [(1, 1), (1, 2), (1, 3), (1, 33), (2, 1), (2, 2)]
+    found = read_names([f"part{c}_{i:04d}" for c, i in parts], "t.json", views=PATH[:6])
+    assert np.diff(found.frames).tolist() == [1, 1, 30, 1, 1]
+    clocks = [(58, 0), (58, 500), (59, 250), (60, 0), (60, 500), (62, 0)]
+    names = [f"10-{5 + s // 60:02d}-{s % 60:02d}-{t:03d}" for s, t in clocks]
+    assert np.diff(read_names(names, "t.json", views=PATH[:6]).frames).tolist() == [500, 750, 750, 500, 1500]
+
+
+def test_cameras_beside_each_other_that_move_on_are_a_rig():
+    directions = [(0, 0, 3), (3, 0, 0), (-3, 0, 0)]
+    views = [(i, 0, 0, *directions[k]) for i in range(4) for k in range(3)]
+    found = read_names(in_groups("{:03d}_{}", range(4), range(3)), "t.json", views=views)
+    assert found.frames == [i for i in range(4) for _ in range(3)]
 
 
 @pytest.mark.parametrize(
     ("names", "said"),
     [
+        ([f"cam{k}/DSC_{100 * k + i:04d}" for k in range(3) for i in range(1, 5)],
+         "one numbering of all images, 1 to 204, but got 201 to 204 for 'cam2/DSC_0201'"),
+        ([f"{split}/r_{i}" for split, n in (("train", 20), ("test", 17)) for i in range(n)], "0 to 16 for"),
+        (["3f2a91", "b07c44", "aa1f03", "9c8e77", "d4d5e6"], "what is beside the numbers differs"),
         (in_groups("{}_{:03d}", range(3), range(4)), r"names as '0_000': .* \(4 times\), or .* \(12 times\)"),
         ([f"IMG_20231115_1704{i:02d}" for i in range(9)] + ["IMG_20231115_170403 (1)"], r"'IMG_.*1\)'; ren"),
         ([f"r_{i:03d}" for i in range(30)] + ["r_90000"], "number of r_90000: expected .* 1 to 28"),
@@ -92,7 +117,7 @@ def test_names_of_several_readings_are_refused(names, said):
 @pytest.mark.parametrize("form", ["seq-{:02d}/frame-{:06d}", "clip{}_frame{:04d}", "c{}_{:05d}"])
 def test_words_that_positions_contradict_are_refused(form):
     with refused("positions continue one path; .*data.name_pattern"):
-        read_names(in_groups(form, range(3), range(4)), "t.json", centers=PATH)
+        read_names(in_groups(form, range(3), range(4)), "t.json", views=PATH)
 
 
 def test_names_that_say_nothing():
@@ -107,6 +132,10 @@ def test_a_pattern_settles_every_case():
     found = read_names(names, "t.json", r"(?P<camera>\d)_(?P<frame>\d+)")
     assert (found.frames, found.cameras) == ([4, 6, 4, 6], ["0", "0", "1", "1"])
     assert read_names(["a1.5", "a2"], "t.json", r"a(?P<time>[\d.]+)").frames == [1.5, 2]
+    clocks = ["x_10-05-59", "x_10-06-01.5", "x_00:07"]
+    assert read_names(clocks, "t.json", "_(?P<time>.*)").frames == [36359, 36361.5, 7]
+    dated = read_names(["2024-05-01 23.59.59", "2024-05-02 00.00.01"], "t.json", "(?P<time>.*)")
+    assert np.diff(dated.frames) == [2]
 
 
 @pytest.mark.parametrize(

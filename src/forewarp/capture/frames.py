@@ -9,7 +9,6 @@ import math
 import re
 import shutil
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import nullcontext, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -252,9 +251,13 @@ def _from_folder(folder: Path, source: Source, step: Step) -> dict:
     names = [path.relative_to(source.images).with_suffix("").as_posix() for path in paths]
     where, read, numbers = source.images, None, rows
     assumed = f"{where}: times are even, in the order of the images' names"
-    # Images of one camera have an order, whatever else their names may say.
-    with nullcontext() if as_stored or source.name_pattern is not None else suppress(SceneError):
+    try:
         read = read_names(names, str(where), source.name_pattern)
+    except SceneError as error:
+        if as_stored or source.name_pattern is not None:
+            raise
+        # Images of one camera have an order, whatever else their names may say.
+        assumed = f"{assumed}, so gaps are lost ({str(error).removeprefix(f'{where}: ')})"
     if read is not None and (as_stored or len({*read.frames}) == len(paths)):
         numbers, assumed = dict(zip(paths, read.times)), f"{where}: times: {read.told}"
         paths.sort(key=numbers.get)

@@ -215,8 +215,8 @@ def _read_records(
         assumed += [line for _, lines in parts for line in lines]
     everything = [record for split in SPLITS for record in records[split]]
     names = [_name(folder, record) for record in everything]
-    centers = [record.camera.center.tolist() for record in everything]
-    times, told = times_of(names, [record.time for record in everything], str(folder), name_pattern, centers)
+    cameras = [record.camera for record in everything]
+    times, told = times_of(names, [record.time for record in everything], str(folder), name_pattern, cameras)
     assumed += [told] if told else []
     given = {split: {_name(folder, record): record.time for record in records[split]} for split in SPLITS}
     check_times(given, str(folder))

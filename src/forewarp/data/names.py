@@ -7,6 +7,7 @@ import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime, timezone
+from itertools import accumulate
 from statistics import median
 from typing import NamedTuple
 
@@ -24,14 +25,19 @@ _DATED = re.compile(
     r"(?:(\d\d)(\d\d)(\d\d)|(\d\d?)([-_.:])(\d\d)(?:\9(\d\d))?)(?:\.?(\d{3}))?(?!\d)"
     r"(?:\s?([AaPp])\.?[Mm]\b\.?)?"
 )
+_DATE = re.compile(r"(?<!\d)((?:19|20)\d\d)([-_.]?)(0[1-9]|1[0-2])\2([0-2]\d|3[01])(?!\d)")
 _STOPWATCH = re.compile(r"(?<!\d)(\d\d?)h(\d\d)m(\d\d)s(\d{3})?(?!\d)")  # as media players write it
 _SECONDS_NANOSECONDS = re.compile(r"(?<!\d)(\d{9,10})[_-](\d{9})(?!\d)")
 _FRAME_WORD = re.compile(r"(?i)(?:^|[^a-z])(frame|time|t)[_-]?$")
 _CAMERA_WORD = re.compile(r"(?i)(?:^|[^a-z])(cam|camera|view|sensor|c|v)[_( -]*$")
+_LETTER_WORD = re.compile(r"(?i)(?:^|[^a-z])[cv][_( -]*$")  # before two digits at most: C0001 is a clip
+_SPLIT_WORD = re.compile(r"(?i)(?:^|/)(train|val|valid|validation|eval|test)\b")
+_OF_TIME = re.compile(r"(?:(\d+)[h:_.-])?(\d{1,2})[m:_.-](\d\d(?:[.,]\d+)?)s?")  # of a group ``time``
 _EXPONENT = re.compile(r"\d\.\d*[eE][-+]?\d")
 _CLOCK = re.compile(r"([01]\d|2[0-3])([0-5]\d)([0-5]\d)?")  # digits that may be a time of day
-_DAY = re.compile(r"(19|20)\d\d(0[1-9]|1[0-2])([0-2]\d|3[01])")
 _ODD = 0.2  # share of the names that may have another form than all others, and are then named in the error
+_LEAST_WORDS = 4  # different texts beside the numbers, from which on these may tell nothing
+_CARRY = 3.0  # steps of the last number from its end and its beginning within which it is carried over
 _SAME_FRAMES = 0.8  # share of all frame numbers that each camera must have where no word tells the camera
 _SPAN = 0.8  # share of the whole sequence that each camera's, or each split's, frame numbers must span
 _COUNTER_DIGITS = 3  # from which a counter may begin anew after its last number
@@ -66,8 +72,12 @@ def name_parts(name: str) -> list[str | float]:
 
 def _split(name: str) -> list[str]:
     """Split a name into text, at even places, and digits; date and time of day are written as seconds."""
-    name = _STOPWATCH.sub(_milliseconds, _DATED.sub(_seconds, name))
-    return re.split(_NUMBER, _SECONDS_NANOSECONDS.sub(r"\1.\2", name))
+    return re.split(_NUMBER, _in_seconds(name))
+
+
+def _in_seconds(name: str) -> str:
+    """Write date and time of day, stopwatches, and seconds with nanoseconds as numbers."""
+    return _SECONDS_NANOSECONDS.sub(r"\1.\2", _STOPWATCH.sub(_milliseconds, _DATED.sub(_seconds, name)))
 
 
 def _seconds(match: re.Match) -> str:
@@ -144,16 +154,17 @@ def read_names(
     names: Sequence[str],
     where: str,
     pattern: str | None = None,
-    centers: Sequence[Sequence[float]] | None = None,
+    views: Sequence[Sequence[float]] | None = None,
 ) -> NameNumbers | None:
     """Read a frame number or a time from each name, if there is one way to read them.
 
     Args:
         names: paths of the images without suffix, ``cam01/0003``; of all splits together.
         where: what the names are of, for errors.
-        pattern: regular expression with a group ``time`` or ``frame``, and ``camera`` for a rig, that is
-            found in every name; None: see the module's rules below.
-        centers: positions of the cameras (x, y, z), which tell cameras of a rig from parts of one film.
+        pattern: regular expression with a group ``time`` (a number, or a time of day as 10-05-30) or
+            ``frame``, and ``camera`` for a rig, that is found in every name; None: see the rules below.
+        views: a row of numbers for each image, near where cameras stand and look alike, such as their
+            positions; they tell cameras of a rig from parts of one film.
 
     Returns:
         the numbers; None where names have no number that varies, or have one twice and no other.
@@ -174,25 +185,28 @@ def read_names(
     """
     if pattern is not None:
         return _by_pattern(names, where, pattern)
-    rows = _of_one_form(names, where) if names else None
+    rows = _of_one_form(_with_days(names), names, where) if names else None
     if rows is None:
         return None
     if any(map(_EXPONENT.search, names)):
         raise _two_ways(where, names[0], "numbers with exponents")
     fractions = [i for i in range(3, len(rows[0]), 2) if _joined_fraction(rows, i)]
     for i in range(1, len(rows[0]), 2):
-        _read_clock(rows, i, where)
+        _read_clock(rows, i, names[0], where)
     places = [i for i in range(1, len(rows[0]), 2) if len({float(row[i]) for row in rows}) > 1]
     places = [i for i in places if i not in fractions]
-    if not places or all(_word(rows, i, _CAMERA_WORD) for i in places):
+    words = {tuple(re.sub("[^a-z]", "", row[i].lower()) for i in range(0, len(row), 2)) for row in rows}
+    if not places or all(_camera_word(rows, i) for i in places):
         return None
-    reading = _chosen(rows, places, where, centers)
+    if len(words) >= max(_LEAST_WORDS, len(names) / 2):
+        raise _two_ways(where, names[0], "what is beside the numbers differs from image to image")
+    reading = _chosen(rows, places, names[0], where, views)
     if reading is None:
         return None
     frames, told = _unrolled(reading)
     refuse_far(dict(zip(names, frames)), where, "number", f"rename it, or {KEY}")
+    _check_groups(reading, names, where, views, any(_camera_word(rows, i) for i in places))
     if len({*frames}) < len(frames):
-        _check_groups(reading, names, where)
         told += "; images of one number share a time"
     cameras = ["".join(camera) for camera in reading.cameras] if len({*reading.cameras}) > 1 else None
     return NameNumbers(frames, cameras, told)
@@ -217,10 +231,7 @@ def _by_pattern(names: Sequence[str], where: str, pattern: str) -> NameNumbers:
         missed = names[matches.index(None)]
         raise mismatch("data.name_pattern", f"to be found in every name of {where}", f"not in '{missed}'")
     for name, match in zip(names, matches):
-        try:
-            frames.append(float(match[groups[0]]))
-        except (TypeError, ValueError):
-            frames.append(math.nan)
+        frames.append(_number_of(match[groups[0]]))
         if not math.isfinite(frames[-1]):
             got = f"'{match[groups[0]]}' of '{name}'"
             raise mismatch(f"data.name_pattern: group {groups[0]}", "a number", got)
@@ -234,20 +245,54 @@ def _by_pattern(names: Sequence[str], where: str, pattern: str) -> NameNumbers:
         got = f"{frames[twice]:g} again in '{names[twice]}'"
         advice = "name the camera by a group 'camera'" if cameras is None else ""
         raise mismatch("data.name_pattern", expected, got, advice)
+    refuse_far(dict(zip(names, frames)), where, "time", "rename it, or set another data.name_pattern")
     return NameNumbers(frames, cameras, "taken from the images' names by data.name_pattern")
 
 
-def _of_one_form(names: Sequence[str], where: str) -> list[list[str]] | None:
+def _number_of(text: str | None) -> float:
+    """Read the number that a group of a pattern found, or the seconds of a time of day; else NaN."""
+    text = _in_seconds(text or "")
+    if match := _OF_TIME.fullmatch(text):
+        hours, minutes, seconds = match[1] or 0, match[2], match[3].replace(",", ".")
+        if float(seconds) < 60 and int(minutes) < 60 and not re.fullmatch(r"\d+\.\d+", text):
+            return (int(hours) * 60 + int(minutes)) * 60 + float(seconds)
+    try:
+        return float(text)
+    except ValueError:
+        return math.nan
+
+
+def _with_days(names: Sequence[str]) -> Sequence[str]:
+    """Write the dates of all names as seconds since 1970, where they vary and have no time of day."""
+    dates = [_DATE.search(_in_seconds(name)) for name in names]
+    if None in dates or len({match[0] for match in dates}) < 2:
+        return names
+    try:
+        days = [datetime(*map(int, match.group(1, 3, 4)), tzinfo=timezone.utc) for match in dates]
+    except ValueError:
+        return names
+    whole = (f"{int(day.timestamp())}.000000" for day in days)
+    return [
+        f"{match.string[: match.start()]}{day}{match.string[match.end() :]}"
+        for match, day in zip(dates, whole)
+    ]
+
+
+def _of_one_form(written: Sequence[str], names: Sequence[str], where: str) -> list[list[str]] | None:
     """Split all names into as many texts and numbers; None where they have no number in common.
+
+    Args:
+        written: the names, with dates as numbers.
+        names, where: see ``read_names``.
 
     Raises:
         SceneError: naming one of a few names that differ from all others.
     """
-    rows = [_split(name) for name in names]
+    rows = [_split(name) for name in written]
     counts = [len(row) for row in rows]
     if len({*counts}) > 1:  # folders may be called differently
-        files = [_split(name.rpartition("/")[2]) for name in names]
-        folders = [name.rpartition("/")[0] for name in names]
+        files = [_split(name.rpartition("/")[2]) for name in written]
+        folders = [name.rpartition("/")[0] for name in written]
         rows = [[f"{folder}/{row[0]}", *row[1:]] for folder, row in zip(folders, files)]
         counts = [len(row) for row in rows]
     usual = max({*counts}, key=counts.count)
@@ -268,6 +313,12 @@ def _word(rows: Sequence[Sequence[str]], place: int, word: re.Pattern) -> bool:
     return all(word.search(row[place - 1]) for row in rows)
 
 
+def _camera_word(rows: Sequence[Sequence[str]], place: int) -> bool:
+    """Tell whether a word for cameras stands before a number in all names; a letter, before two digits."""
+    is_short = all(len(row[place]) <= 2 for row in rows)
+    return _word(rows, place, _CAMERA_WORD) and (is_short or not _word(rows, place, _LETTER_WORD))
+
+
 def _joined_fraction(rows: list[list[str]], place: int) -> bool:
     """Join a fraction of a second to the seconds before it, and tell whether there was one.
 
@@ -276,7 +327,7 @@ def _joined_fraction(rows: list[list[str]], place: int) -> bool:
     """
     if any(row[place - 1] != "." or "." in row[place - 2] + row[place] for row in rows):
         return False
-    if _word(rows, place - 2, _CAMERA_WORD):
+    if _camera_word(rows, place - 2):
         return False
     if not _word(rows, place - 2, _FRAME_WORD):
         widths, most = {len(row[place]) for row in rows}, max(int(row[place]) for row in rows)
@@ -289,41 +340,47 @@ def _joined_fraction(rows: list[list[str]], place: int) -> bool:
     return True
 
 
-def _read_clock(rows: list[list[str]], place: int, where: str) -> None:
+def _read_clock(rows: list[list[str]], place: int, name: str, where: str) -> None:
     """Turn digits that are a time of day in all names, ``103059`` or behind a date ``1030``, into seconds.
 
-    A counter that is none of these has a number whose last two digits are above 59.
+    A counter that is none of these has a number whose last two digits are above 59, or grows by one step.
 
     Raises:
         SceneError: for times more than half a day apart, whose film may have gone on after midnight.
     """
     digits = [row[place] for row in rows]
     behind_a_day = place > 1 and all(
-        row[place - 1] in "-_" and _DAY.fullmatch(row[place - 2]) for row in rows
+        row[place - 1] in "-_" and _DATE.fullmatch(row[place - 2]) for row in rows
     )
     matches = [_CLOCK.fullmatch(text) for text in digits]
     if None in matches or len({*digits}) < 2 or not (behind_a_day or all(match[3] for match in matches)):
         return
-    if int(max(digits)) < (100 if len(digits[0]) == 4 else 10000):
+    counts = sorted({int(text) for text in digits})
+    is_even = len(counts) > 2 and len({b - a for a, b in zip(counts, counts[1:])}) == 1
+    if counts[-1] < (100 if len(digits[0]) == 4 else 10000) or (is_even and not behind_a_day):
         return
     seconds = [sum(f * int(part or 0) for f, part in zip((3600, 60, 1), match.groups())) for match in matches]
     if max(seconds) - min(seconds) > 12 * 3600:
-        raise _two_ways(where, "".join(rows[0]), "times of day more than half a day apart")
+        raise _two_ways(where, name, "times of day more than half a day apart")
     for row, second in zip(rows, seconds):
         row[place] = str(second)
 
 
 def _chosen(
-    rows: list[list[str]], places: list[int], where: str, centers: Sequence[Sequence[float]] | None
+    rows: list[list[str]],
+    places: list[int],
+    name: str,
+    where: str,
+    views: Sequence[Sequence[float]] | None,
 ) -> _Reading | None:
-    """Choose the one reading that survives.
+    """Choose the one reading that survives; ``name`` is the first, for errors.
 
     Raises:
         SceneError: naming the readings where two do.
     """
     texts = [i for i in range(0, len(rows[0]), 2) if len({row[i] for row in rows}) > 1]
     named = [i for i in places if _word(rows, i, _FRAME_WORD)]
-    for_cameras = [i for i in places if _word(rows, i, _CAMERA_WORD)]
+    for_cameras = [i for i in places if _camera_word(rows, i)]
     free = [i for i in places if i not in for_cameras]
     numbers = "taken from the numbers in the images' names"
 
@@ -346,16 +403,16 @@ def _chosen(
             return None
         film = _Reading(together, _ranked(rows, places), [()] * len(rows))
         is_shared = len({*reading.frames}) < len(rows) and film.is_unique
-        if is_shared and centers is not None and _path(reading, film, centers) == "film":
-            raise _two_ways(where, "".join(rows[0]), "words tell cameras, whose positions continue one path")
+        if is_shared and views is not None and _path(reading, film, views) == "film":
+            raise _two_ways(where, name, "words tell cameras, whose positions continue one path")
         return reading
     count = "number {} of each name counts frames, the others tell cameras"
     rigs = [of_place(place, places, count.format(n)) for n, place in enumerate(free, 1)]
     rigs = [rig for rig in rigs if rig.is_unique and rig.is_shared]
     last = of_place(free[-1], places)
-    path = None if centers is None else _path(last, film, centers)
-    if centers is not None and rigs and path != "film":
-        steps = [_step(rig, centers) for rig in rigs]
+    path = None if views is None else _path(last, film, views)
+    if views is not None and rigs and path != "film":
+        steps = [_step(rig, views) for rig in rigs]
         short = min(steps)
         near = [rig for rig, step in zip(rigs, steps) if step <= _ONE_PATH * short]
         if len(near) == 1 and (len(rigs) > 1 or path == "rig" or short == 0):
@@ -364,7 +421,7 @@ def _chosen(
     if film.is_unique and (path == "film" or (path is None and are_parts and not rigs)):
         return film
     readings = [f"{one.what} ({len({*one.frames})} times)" for one in (*rigs, film)]
-    raise _two_ways(where, "".join(rows[0]), ", or ".join(readings))
+    raise _two_ways(where, name, ", or ".join(readings))
 
 
 def _is_stamp(digits: str) -> bool:
@@ -373,9 +430,9 @@ def _is_stamp(digits: str) -> bool:
     return len(whole) >= (9 if point else 13)
 
 
-def _step(rig: _Reading, centers: Sequence[Sequence[float]]) -> float:
+def _step(rig: _Reading, views: Sequence[Sequence[float]]) -> float:
     """Return the median way of a camera of a rig from frame to frame; 0 where cameras stand."""
-    places = np.asarray(centers, np.float64)
+    places = np.asarray(views, np.float64)
     order = sorted(range(len(places)), key=lambda i: (rig.cameras[i], rig.frames[i]))
     steps = np.linalg.norm(np.diff(places[order], axis=0), axis=-1)
     within = [step for a, b, step in zip(order, order[1:], steps) if rig.cameras[a] == rig.cameras[b]]
@@ -384,32 +441,60 @@ def _step(rig: _Reading, centers: Sequence[Sequence[float]]) -> float:
 
 
 def _ranked(rows: Sequence[Sequence[str]], places: Sequence[int]) -> list[float]:
-    """Number names by several numbers, the first of which weighs most.
+    """Number names by several numbers, the first of which weighs most; gaps in the last stay.
 
     Where the last number grows all the way, as of frames counted through all chapters, it is the frame's.
+    Where it is carried over, as of minutes and seconds, both are one number. Else a part goes on one step
+    after the one before it.
     """
     keys = [tuple(float(row[i]) for i in places) for row in rows]
     ordered = sorted({*keys})
     last = [key[-1] for key in ordered]
     if all(a < b for a, b in zip(last, last[1:])):
         return [key[-1] for key in keys]
-    ranks = {key: float(rank) for rank, key in enumerate(ordered)}
-    return [ranks[key] for key in keys]
+    joined, unit = dict(zip(ordered, ordered)), 1.0
+    for place in places[:0:-1]:  # minutes and seconds, seconds and a fraction
+        widths = {len(row[place]) for row in rows}
+        bases = [60 * unit, *[10.0**width * unit for width in widths if len(widths) == 1]]
+        base = next((base for base in bases if _carries(sorted({*joined.values()}), base)), None)
+        if base is None:
+            break
+        joined = {key: (*part[:-2], part[-2] * base + part[-1]) for key, part in joined.items()}
+        unit = base
+    pairs = list(zip(joined.values(), list(joined.values())[1:]))
+    steps = [b[-1] - a[-1] if a[:-1] == b[:-1] else None for a, b in pairs]
+    usual = median([step for step in steps if step is not None] or [1.0])
+    sums = accumulate((usual if step is None else step for step in steps), initial=ordered[0][-1])
+    frames = dict(zip(ordered, sums))
+    return [frames[key] for key in keys]
 
 
-def _path(rig: _Reading, film: _Reading, centers: Sequence[Sequence[float]]) -> str | None:
-    """Tell a rig from one film by where the cameras are; None where that does not tell.
+def _carries(parts: Sequence[tuple[float, ...]], base: float) -> bool:
+    """Tell whether the last of several numbers goes on at 0 where it comes to ``base`` and the one before it
+    grows by 1, as seconds and minutes do.
+    """
+    pairs = list(zip(parts, parts[1:]))
+    within = [b[-1] - a[-1] for a, b in pairs if a[:-1] == b[:-1]]
+    meets = [(a[-1], b[-1]) for a, b in pairs if a[:-2] == b[:-2] and b[-2] - a[-2] == 1]
+    if not within or not meets or any(part[-1] >= base for part in parts):
+        return False
+    room = _CARRY * median(within)
+    return all(end >= base - room and start < room for end, start in meets)
+
+
+def _path(rig: _Reading, film: _Reading, views: Sequence[Sequence[float]]) -> str | None:
+    """Tell a rig from one film by what cameras see; None where that does not tell.
 
     Ordered as one film, a camera that moves on makes steps of about one length also where what would be
     cameras of a rig meet.
     """
     order = np.argsort(film.frames, kind="stable")
-    steps = np.linalg.norm(np.diff(np.asarray(centers, np.float64)[order], axis=0), axis=-1)
+    steps = np.linalg.norm(np.diff(np.asarray(views, np.float64)[order], axis=0), axis=-1)
     cameras = [rig.cameras[i] for i in order]
     meets = [a != b for a, b in zip(cameras, cameras[1:])]
     within = [step for step, meet in zip(steps, meets) if not meet]
     across = [step for step, meet in zip(steps, meets) if meet]
-    extent = float(np.ptp(np.asarray(centers, np.float64), axis=0).max())
+    extent = float(np.ptp(np.asarray(views, np.float64), axis=0).max())
     if not within or not across or median(within) > _STEP * extent or extent == 0:
         return None
     least = 1e-6 * extent
@@ -428,7 +513,8 @@ def _unrolled(reading: _Reading) -> tuple[list[float], str]:
     rolls = turn >= 10**_COUNTER_DIGITS and min(ends) > 1
     if not rolls or gap < 0.5 * turn or highest % 1 or lowest % 1:
         return frames, told
-    frames = [frame if frame >= after else frame + turn for frame in frames]
+    skips = int(lowest > 0)  # counters that begin at 1
+    frames = [frame if frame >= after else frame + turn - skips for frame in frames]
     told = f"{reading.what}: {after:g} to {highest:g}, then {lowest:g} on, taken as a counter that began anew"
     return frames, told
 
@@ -449,19 +535,38 @@ def refuse_far(named: Mapping[str, float], where: str, what: str, advice: str) -
         raise mismatch(f"{where}: {what} of {name}", expected, f"{far:.10g}", advice)
 
 
-def _check_groups(reading: _Reading, names: Sequence[str], where: str) -> None:
-    """Refuse cameras or splits that share some numbers and were counted apart, as 0 to 149 and 0 to 19."""
+def _check_groups(
+    reading: _Reading,
+    names: Sequence[str],
+    where: str,
+    views: Sequence[Sequence[float]] | None,
+    has_word: bool,
+) -> None:
+    """Refuse cameras or splits that were counted apart: that share some numbers, as 0 to 149 and 0 to 19, or,
+    cameras that film together, none, as 1 to 14 and 101 to 114.
+    """
     everything = sorted({*reading.frames})
     whole, groups = everything[-1] - everything[0], reading.groups
+    first = {camera: name for name, camera in zip(names[::-1], reading.cameras[::-1])}
     counted = [sum(number in group for group in groups) for number in everything]
-    if max(counted) == 1:  # no number twice: one numbering of all
+    one_numbering = f"one numbering of all images, {everything[0]:g} to {everything[-1]:g}"
+
+    def apart(group: set[float], camera: tuple) -> SceneError:
+        got = f"{min(group):g} to {max(group):g} for '{first[camera]}' and its like"
+        return mismatch(where, one_numbering, got, f"write time in each frame, or {KEY}")
+
+    if max(counted) == 1:  # no number twice: one numbering of all, unless cameras film together
+        are_long = reading.is_apart and len(groups) > 1 and min(map(len, groups)) > 1
+        path = None if views is None or not are_long else _path(reading, reading, views)
+        if are_long and (path == "rig" or (has_word and path is None)):
+            raise apart(groups[-1], [*dict.fromkeys(reading.cameras)][-1])
         return
     letters = [tuple(re.sub("[^a-z0-9/]", "", part.lower()) for part in camera) for camera in reading.cameras]
     if len(groups) > len(names) / 2 or not replace(reading, cameras=letters).is_unique:
         raise _two_ways(where, names[0], "what is beside the numbers differs from image to image")
+    step = min(b - a for a, b in zip(everything, everything[1:]))
     for group, camera in zip(groups, dict.fromkeys(reading.cameras)):
-        if len(group) > 1 and max(group) - min(group) < _SPAN * whole:
-            name = names[reading.cameras.index(camera)]
-            expected = f"one numbering of all images, {everything[0]:g} to {everything[-1]:g}"
-            got = f"{min(group):g} to {max(group):g} for '{name}' and its like"
-            raise mismatch(where, expected, got, f"write time in each frame, or {KEY}")
+        span = max(group) - min(group)
+        is_dense = span < whole and span == step * (len(group) - 1) and _SPLIT_WORD.search(first[camera])
+        if len(group) > 1 and (span < _SPAN * whole or is_dense):
+            raise apart(group, camera)

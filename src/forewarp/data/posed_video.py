@@ -163,8 +163,8 @@ def read_scene(
     for load in cut_out:  # none is decoded yet
         load.premultiplied = premultiplied
     names = [entry.name for entry in entries]
-    centers = [entry.camera.center.tolist() for entry in entries]
-    times, told = times_of(names, [entry.time for entry in entries], str(file), name_pattern, centers)
+    cameras = [entry.camera for entry in entries]
+    times, told = times_of(names, [entry.time for entry in entries], str(file), name_pattern, cameras)
     if name_pattern is not None and all(entry.taken_by is None for entry in entries):
         cameras = read_names(names, str(file), name_pattern).cameras or [None] * len(names)
         entries = [replace(entry, taken_by=camera) for entry, camera in zip(entries, cameras)]

@@ -361,7 +361,7 @@ def times_of(
     times: Sequence[float | None],
     where: str,
     pattern: str | None = None,
-    centers: Sequence[Sequence[float]] | None = None,
+    cameras: Sequence[Camera] | None = None,
 ) -> tuple[list[float], str | None]:
     """Give each image a time in [0, 1], where the file has none by the numbers in the images' names.
 
@@ -372,7 +372,8 @@ def times_of(
         names: paths of the images without suffix, ``cam01/0003``; of all splits together.
         times: what the file says.
         where: the file, for errors.
-        pattern, centers: see ``names.read_names``; with a pattern names win over the file.
+        pattern: see ``names.read_names``; with one names win over the file.
+        cameras: of the images, whose places and directions tell cameras of a rig from parts of one film.
 
     Returns:
         the times, and a line that says what was assumed; None if the file has all times, in [0, 1] and well
@@ -400,12 +401,20 @@ def times_of(
         got = f"{sum(given)} of {len(given)}, and none for {names[given.index(False)]}"
         raise mismatch(f"{where}: frames: time", "one in all frames or in none", got)
     why = "times in the frames are not read" if any(given) else "no time in the frames"
-    read = read_names(names, where, pattern, centers)
+    views = None if cameras is None else _views_of(cameras)
+    read = read_names(names, where, pattern, views)
     if read is None:
         order, last = in_order(range(len(names)), lambda i: names[i]), max(len(names) - 1, 1)
         line = f"{where}: {why}: spread evenly in the order of the images' names"
         return [rank / last for rank in np.argsort(order).tolist()], line
     return read.times, f"{where}: {why}: {read.told}"
+
+
+def _views_of(cameras: Sequence[Camera]) -> list[list[float]]:
+    """Return where cameras stand and look: positions, and directions as far away as all of them are apart."""
+    poses = torch.stack([camera.camera_to_world for camera in cameras])
+    places, axes = poses[:, :3, 3], poses[:, :3, 2]
+    return torch.cat([places, axes * float((places - places[0]).abs().max())], 1).tolist()
 
 
 def check_times(splits: Mapping[str, Mapping[str, float | None]], where: str) -> None:
