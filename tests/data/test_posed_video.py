@@ -246,6 +246,29 @@ def test_derived_ends_hold_what_is_looked_at_and_are_said(made, caplog):
     assert all(low < 0 < high for low, high in zip(scene.box.low, scene.box.high))
 
 
+def test_points_far_from_the_origin_are_as_exact_as_the_cameras(tmp_path):
+    shift, random = np.array([456_012.0, 4_650_123.0, 80.0]), np.random.default_rng(0)
+    points = MIDDLE.numpy() + random.uniform(-3, 3, (40, 3))
+    scenes = []
+    for name, by in (("near", np.zeros(3)), ("far", shift)):
+        views = list(posed_cameras(10))
+        for view in views:
+            view.camera_to_world[:3, 3] += torch.from_numpy(by)
+        write_scene(tmp_path / name, posed_shots(views=views), near=20.0, far=120.0, points=points + by)
+        scenes.append(read_scene(tmp_path, name))
+        (tmp_path / name / "points.npy").unlink()
+        head = ["ply", "format ascii 1.0", "element vertex 40", *(f"property double {c}" for c in "xyz")]
+        rows = (" ".join(map(repr, row)) for row in (points + by).tolist())
+        (tmp_path / name / "sparse_pc.ply").write_text("\n".join([*head, "end_header", *rows]))
+        scenes.append(read_scene(tmp_path, name))
+    for scene in scenes[1:]:
+        torch.testing.assert_close(scene.still, scenes[0].still, atol=1e-6, rtol=0)
+    there = scenes[-1].world
+    torch.testing.assert_close(
+        there.to_data(scenes[-1].still), torch.from_numpy(points + shift), atol=1e-4, rtol=0
+    )
+
+
 def test_ends_come_from_the_config_then_from_the_file(tmp_path, made):
     scale = made().protocol["normalisation"]["scale"]
     for options, expected in (({}, (20, 120)), ({"near": 30}, (30, 120)), ({"near": 5, "far": 60}, (5, 60))):

@@ -90,7 +90,7 @@ def source_of(run, module, model: str, times: list[float]):
     cameras, taken = [frame.camera for frame in scene.train], [frame.time for frame in scene.train]
     background = tuple(run.datamodule.targets("train").background.tolist())
     place = tuple(scene.protocol.get("span", (0.0, 1.0))), scene.protocol.get("window", [0.0])[0]
-    return Source(module, model, cameras, times, background, scene.name, taken, *place)
+    return Source(module, model, cameras, times, background, scene.name, taken, *place, world=scene.world)
 
 
 def summary(about: dict) -> str:

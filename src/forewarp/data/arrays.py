@@ -16,6 +16,7 @@ from forewarp.data.images import read_gray16
 from forewarp.files import MOST_ARRAYS, MOST_POINTS, unpack_arrays, written_whole
 from forewarp.ops.grid import reduced_depth
 from forewarp.scene.frame import Truth
+from forewarp.scene.world import SAME, World
 
 _SAME_TIME = 1e-6
 
@@ -45,8 +46,9 @@ class StoredDepth:
         return reduced_depth(torch.from_numpy(depth)) if self.halve else torch.from_numpy(depth)
 
 
-def read_truth(path: Path, canonical_time: float) -> Truth | None:
-    """Read trajectories from an .npz with ``points`` (N, T, 3) and ``times`` (T,); None without the file.
+def read_truth(path: Path, canonical_time: float, world: World = SAME) -> Truth | None:
+    """Read trajectories from an .npz with ``points`` (N, T, 3), which a world moves to the scene's, and
+    ``times`` (T,); None without the file.
 
     Raises:
         SceneError: for other keys, shapes or values, or a first time that is not the canonical one.
@@ -64,7 +66,7 @@ def read_truth(path: Path, canonical_time: float) -> Truth | None:
         expected = f"numbers in [0, 1] that begin at the canonical time {canonical_time:g}"
         got = f"{times.min():g} to {times.max():g} beginning at {times[0]:g}"
         raise mismatch(f"{path}: times", expected, got)
-    return Truth(torch.from_numpy(points.astype(np.float32)), torch.from_numpy(times.astype(np.float64)))
+    return Truth(world.to_scene(points).float(), torch.from_numpy(times.astype(np.float64)))
 
 
 def shortened(truth: Truth, end: float) -> Truth | None:
@@ -76,7 +78,7 @@ def shortened(truth: Truth, end: float) -> Truth | None:
 
 
 def read_cloud(path: Path, columns: int) -> np.ndarray:
-    """Read points (N, columns) float32, N >= 1, places first, from a .npy file, the ``v`` lines of an .obj
+    """Read points (N, columns) float64, N >= 1, places first, from a .npy file, the ``v`` lines of an .obj
     or the vertices of a .ply, of which places alone are read.
 
     Raises:
@@ -90,7 +92,7 @@ def read_cloud(path: Path, columns: int) -> np.ndarray:
     advice = "export it again"
     check_shape(points, path, f"points (N, {columns})", None, columns, advice=advice)
     with np.errstate(over="ignore", invalid="ignore"):
-        points = np.array(points, np.float32)
+        points = np.array(points, np.float64)
     bad = ~np.isfinite(points).all(1)
     if bad.any():
         got = f"{points[bad][0].tolist()} in row {bad.argmax()} and {bad.sum()} such rows"
@@ -140,12 +142,12 @@ def _ply_places(path: Path) -> np.ndarray:
     return np.stack([np.asarray(rows[name], np.float64) for name in "xyz"], 1)
 
 
-def write_array(path: Path, values: Tensor | np.ndarray | None) -> None:
-    """Write depth (H, W) or points (N, C) as float32 .npy, whole or not at all; nothing of None."""
+def write_array(path: Path, values: Tensor | np.ndarray | None, dtype: type = np.float32) -> None:
+    """Write depth (H, W) or points (N, C) as .npy, whole or not at all; nothing of None."""
     if values is None:
         return
     with written_whole(path) as beside:
-        np.save(beside, np.asarray(values, np.float32))
+        np.save(beside, np.asarray(values, dtype))
 
 
 def write_truth(path: Path, truth: Truth | None) -> None:

@@ -16,6 +16,7 @@ from torch import Tensor
 from forewarp.data.files import mismatch, number
 from forewarp.scene.box import Box
 from forewarp.scene.camera import Camera, Lens, focus_point
+from forewarp.scene.world import World
 
 log = logging.getLogger(__name__)
 
@@ -154,18 +155,11 @@ def nine_pixels(camera: Camera) -> torch.Tensor:
 
 
 @dataclass(frozen=True)
-class Normalisation:
-    """The map ``X_scene = (X - center) * scale`` of a file's world; near and far are in the scene's units."""
+class Normalisation(World):
+    """A file's world, and near and far in the scene's units."""
 
-    center: tuple[float, float, float]
-    scale: float
-    near: float
-    far: float
-
-    def points(self, points: np.ndarray | torch.Tensor) -> torch.Tensor:
-        """Move points (..., 3) from the file's world to the scene's: float64."""
-        center = torch.tensor(self.center, dtype=torch.float64)
-        return (torch.as_tensor(points).double() - center) * self.scale
+    near: float = 0.0
+    far: float = 1.0
 
     @property
     def told(self) -> dict:
@@ -174,8 +168,7 @@ class Normalisation:
 
     def camera(self, camera: Camera) -> Camera:
         """Move a camera from the file's world to the scene's."""
-        pose = camera.camera_to_world.clone()
-        pose[:3, 3] = self.points(pose[:3, 3])
+        pose = self.to_scene(camera.camera_to_world)
         return replace(camera, camera_to_world=pose, near=self.near, far=self.far)
 
 
@@ -211,7 +204,7 @@ def space_of(
     space = Normalisation(center, 1 / size, near / size, far / size)
 
     def moved(box: Box) -> Box:
-        return Box(*space.points(np.array([box.low, box.high])).tolist())
+        return Box(*space.to_scene(np.array([box.low, box.high])).tolist())
 
     try:
         if box is not None:

@@ -152,7 +152,7 @@ def read_scene(
     protocol |= {"test_frames": len(test), "normalisation": space.told if is_moved else None}
     protocol["assumed"] = assumed or None
     truth = read_truth(folder / "trajectories.npz", canonical)
-    return Scene(scene, train, val, test, bounds, canonical, has_alpha, truth, protocol)
+    return Scene(scene, train, val, test, bounds, canonical, has_alpha, truth, protocol, world=space)
 
 
 def _space(

@@ -20,7 +20,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from reprlib import repr as short
 
@@ -214,11 +214,9 @@ def read_scene(
         "assumed": assumed or None,
     }
     bounds = box_of(box) or frustum_box(f.camera for f in train)
-    truth = read_truth(folder / "trajectories.npz", canonical)
-    if truth is not None:
-        truth = replace(truth, points=normalised.points(truth.points).float())
-    still = normalised.points(read_cloud(points, 3)).float() if points.exists() else None
-    return Scene(scene, train, (), test, bounds, canonical, False, truth, protocol, still)
+    truth = read_truth(folder / "trajectories.npz", canonical, normalised)
+    still = normalised.to_scene(read_cloud(points, 3)).float() if points.exists() else None
+    return Scene(scene, train, (), test, bounds, canonical, False, truth, protocol, still, world=normalised)
 
 
 def write_scene(
@@ -261,7 +259,7 @@ def write_scene(
         parts[shot.split].append(shot.name)
         times = dict.fromkeys(("time_id", "warp_id", "appearance_id"), int(shot.time_id))
         metadata[shot.name] = times | {"camera_id": shot.camera_id}
-    write_array(folder / "points.npy", points)
+    write_array(folder / "points.npy", points, np.float64)
     write_truth(folder / "trajectories.npz", trajectories)
     world = {"scale": float(scale), "center": [float(v) for v in center]}
     world |= {"near": float(near), "far": float(far)}

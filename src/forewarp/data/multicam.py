@@ -156,7 +156,7 @@ def read_scene(
         "assumed": assumed or None,
     }
     canonical = middle_of(frame.time for frame in train)
-    return Scene(scene, train, (), test, seen, canonical, False, protocol=protocol)
+    return Scene(scene, train, (), test, seen, canonical, False, protocol=protocol, world=space)
 
 
 def write_poses(folder: str | Path, cameras: Sequence[Camera], *, near: float, far: float) -> None:

@@ -197,7 +197,7 @@ def read_scene(
     space, seen = space_of([entry.camera for entry in entries], str(file), **options)
 
     cloud = _points_of(file, content)
-    still = None if cloud is None else space.points(read_cloud(cloud, 3)).float()
+    still = None if cloud is None else space.to_scene(read_cloud(cloud, 3)).float()
     if not isinstance(depth, (str, Path, type(None))):
         raise mismatch("data.depth", "a folder, off or null", repr(depth))
     depths, place = {}, None if depth in (None, "off") else file.parent / depth
@@ -261,7 +261,7 @@ def read_scene(
         "depth": f"{depth_kind}, of {count} of {len(train)} training frames" if depths else None,
         "assumed": [*assumed, *filter(None, [told])] or None,
     }
-    return Scene(scene, train, val, test, seen, start, has_alpha, protocol=protocol, still=still)
+    return Scene(scene, train, val, test, seen, start, has_alpha, protocol=protocol, still=still, world=space)
 
 
 def _points_of(file: Path, content: dict) -> Path | None:
@@ -478,7 +478,7 @@ def write_scene(
     content |= stated({"near": near, "far": far, "seconds": seconds, "moving_from": moving_from})
     content |= stated({"aabb": corners})
     content["frames"] = [{k: v for k, v in entry.items() if k not in common} for entry in entries]
-    write_array(folder / POINTS, points if points is not None and len(points) else None)
+    write_array(folder / POINTS, points if points is not None and len(points) else None, np.float64)
     write_json(folder / FILE, content)
 
 

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 
 ABOUT = "about.json"  # in every folder of an export, which may then be replaced
 _AXES = "the data's own world, right-handed, in its own unit of length; turned about its origin if up says so"
+_SHIFTED = "; its coordinates are those of the files, before they are turned, and shift"
 
 
 class Format(NamedTuple):
@@ -113,6 +114,8 @@ def write(
         files = sorted(file for file in part.rglob("*") if file.is_file())
         sizes = {file.relative_to(part).as_posix(): file.stat().st_size for file in files}
         times = {"times": list(source.times)} if FORMATS[kind].times else {}
-        content = {"format": kind, **about, **times, "axes": _AXES, **facts, "bytes": sizes}
+        places = {"axes": _AXES + _SHIFTED * any(source.shift), "shift": list(source.shift)}
+        places["normalisation"] = {"center": list(source.world.center), "scale": source.world.scale}
+        content = {"format": kind, **about, **times, **places, **facts, "bytes": sizes}
         write_json(part / ABOUT, content)
     return content

@@ -78,21 +78,23 @@ def packed_scene(
     written = sum(len(part.order) for part in rows)
     if not written:
         raise ValueError("run: expected particles that can be seen, but got none; train it longer")
-    cameras = [camera for window in windows for camera in window.cameras]
+    worlds = [window.world.without(source.shift) for window in windows]
+    places = zip(windows, worlds)
+    cameras = [world.camera_to_data(camera) for window, world in places for camera in window.cameras]
     ends = [(window.image_times, *window.span) for window in windows]
     times = [first + time * (last - first) for taken, first, last in ends for time in taken]
     numbers = sorted({0, *spread(len(cameras), _CAMERAS)})
     shown, taken = [cameras[n] for n in numbers], [times[n] for n in numbers] if times else []
     rotation, focus = source.rotation_to("y"), focus_point(cameras)
-    setting = Setting(shown, rotation, focus, float(seconds), source.background, taken)
+    setting = Setting(shown, rotation, focus, float(seconds), source.background, taken, source.shift)
     many = int(shared[0][rows[0].order].sum())
     left_out = sum(len(gaussians.means) for gaussians, *_ in parts) - written - many * len(source.later)
     facts = {"particles": written, "moving": sum(part.in_motion for part in rows), "left out": left_out}
     facts |= {"windows": len(windows), "shared": many} if source.later else {}
     facts |= {"quality": quality, "seconds": seconds, "colors": "sRGB, as in the images"}
     film = [
-        (Window(gaussians, window.span, window.begin), part)
-        for window, (gaussians, *_), part in zip(windows, parts, rows)
+        (Window(gaussians.in_data(world), window.span, window.begin), part)
+        for window, world, (gaussians, *_), part in zip(windows, worlds, parts, rows)
     ]
     return write(film, setting, quality, many), facts
 

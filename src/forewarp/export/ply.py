@@ -18,6 +18,7 @@ from forewarp.scene.box import Box, Lattice
 from forewarp.scene.camera import mean_up
 from forewarp.scene.cloud import Ellipsoids
 from forewarp.scene.view import Moment
+from forewarp.scene.world import World
 
 Columns = Mapping[str, np.ndarray]  # by name, in their order
 _TYPES = {"float32": "float", "uint32": "uint", "uint8": "uchar"}
@@ -146,10 +147,26 @@ def packed_columns(columns: Columns) -> dict[str, dict[str, np.ndarray]]:
 
 def header_comments(source: Source, rotation: Tensor) -> list[str]:
     """Return what viewers read in a header: ``Vertical axis: z``, as nerfstudio and Brush write it, where the
-    images' mean upward direction, after a rotation (3, 3), is along an axis or against it; else nothing.
+    images' mean upward direction, after a rotation (3, 3), is along an axis or against it; and the source's
+    shift, if there is any.
     """
     upwards = (rotation @ mean_up(source.cameras)).abs()
-    return [f"Vertical axis: {'xyz'[int(upwards.argmax())]}"] if float(upwards.max()) > ALONG else []
+    lines = [f"Vertical axis: {'xyz'[int(upwards.argmax())]}"] if float(upwards.max()) > ALONG else []
+    shift = " ".join(f"{value:.12g}" for value in source.shift)
+    return lines + [f"Shift: {shift}"] * any(source.shift)
+
+
+def movement_in_data(parts: Mapping[str, Tensor], world: World) -> dict[str, Tensor]:
+    """Move what ``HasEllipsoids.movement`` returns from a scene's world to that of its data."""
+    parts = dict(parts)
+    if "maps" in parts and not world.is_same:
+        linear, added = parts["maps"].double().split([3, 1], -1)
+        origin = world.to_data(added.new_zeros(3))  # of the scene
+        moved = added / world.scale - linear @ origin[:, None]
+        parts["maps"] = torch.cat([linear, moved], -1).float()
+        parts["node_places"] = world.to_data(parts["node_places"]).float()
+        parts["node_shift"] = parts["node_shift"] / world.scale
+    return parts
 
 
 def export_ply(
@@ -172,7 +189,7 @@ def export_ply(
     Raises:
         ValueError: for ``compressed`` without particles.
     """
-    rotation, total = source.rotation_to(up), len(source.times)
+    rotation, total, world = source.rotation_to(up), len(source.times), source.in_files
     if compressed and not source.has_ellipsoids:
         got = f"one of {source.model}"
         raise ValueError(f"compressed: expected a run of particles, but got {got}; leave it out")
@@ -181,17 +198,17 @@ def export_ply(
     files = [folder / "frames" / f"frame_{number:04d}{suffix}" for number in range(total)]
     comments = header_comments(source, rotation)
     if not source.has_ellipsoids:
-        tracks = tracks_of(source, _ALL, progress)
+        tracks = tracks_of(source, _ALL, progress).in_data(world)
         for file, places in zip(files, tracks.positions @ rotation.T.float()):
             write_ply(file, {"vertex": point_columns(places, tracks.colors[0])}, comments=comments)
         facts = {"points": len(tracks), "kind": "points of the surface"}
         return facts | {"colors": "sRGB, 8 bits, as in the images", "up": up}
-    template = source.method.template()
+    template = source.method.template().in_data(world)
     own_degree = math.isqrt(template.harmonics.shape[1]) - 1
     degree = min(degree, own_degree) if compressed else degree
     order = morton(template.centers.cpu().numpy()).argsort(kind="stable") if compressed else slice(None)
     for number, (file, time) in enumerate(zip(files, source.times)):
-        cloud = source.method.ellipsoids(time)
+        cloud = source.method.ellipsoids(time).in_data(world)
         columns = splat_columns(cloud if up == "world" else cloud.turned(rotation), degree)
         columns = {name: column[order] for name, column in columns.items()}
         write_ply(file, packed_columns(columns) if compressed else {"vertex": columns}, comments=comments)
@@ -199,7 +216,8 @@ def export_ply(
     if not compressed:
         comments = header_comments(source, source.rotation_to("world"))
         write_ply(folder / "canonical.ply", {"vertex": splat_columns(template, degree)}, comments=comments)
-        motion = {name: value.cpu().numpy() for name, value in source.method.movement(source.times).items()}
+        motion = movement_in_data(source.method.movement(source.times), world)
+        motion = {name: value.cpu().numpy() for name, value in motion.items()}
         np.savez(folder / "motion.npz", times=np.array(source.times, np.float32), **motion)
     kind = "Gaussian splats, compressed" if compressed else "Gaussian splats"
     facts = {"particles": len(template), "kind": kind, "up": up}
@@ -323,8 +341,8 @@ def export_mesh(
     box = method.bounds(list(source.times))
     if box is None:
         raise ValueError("run: expected matter to make a mesh of, but got none; train it longer")
-    lattice, rotation = lattice_in(box, resolution), source.rotation_to(up).float()
-    vertex_counts, face_counts = [], []
+    lattice, rotation, world = lattice_in(box, resolution), source.rotation_to(up), source.in_files
+    comments, vertex_counts, face_counts = header_comments(source, rotation), [], []
     for number, time in enumerate(source.times):
         if source.has_ellipsoids:
             opacity, colors = voxelize(method.ellipsoids(time), lattice)
@@ -337,11 +355,12 @@ def export_mesh(
                 f"{lowest:.3g} and {highest:.3g}, but got {level}"
             )
         vertices, rgb, faces = isosurface(opacity, colors, lattice, level)
-        vertices, path = vertices @ rotation.T, folder / f"mesh_{number:04d}.{files}"
+        vertices, path = world.to_data(vertices) @ rotation.T, folder / f"mesh_{number:04d}.{files}"
         if files == "ply":
-            write_ply(path, {"vertex": point_columns(vertices, rgb)}, faces)
+            write_ply(path, {"vertex": point_columns(vertices, rgb)}, faces, comments)
         else:
             with path.open("w") as file:  # colours behind the places, a common extension of OBJ
+                file.writelines(f"# {comment}\n" for comment in comments)
                 rows = np.concatenate([vertices.numpy(), rgb.numpy()], -1)
                 np.savetxt(file, rows, "v %.7g %.7g %.7g %.4f %.4f %.4f")
                 np.savetxt(file, faces + 1, "f %d %d %d")
@@ -350,4 +369,4 @@ def export_mesh(
         progress(number + 1, len(source.times))
     facts = {"vertices": vertex_counts, "faces": face_counts, "level": level, "up": up}
     colors = "sRGB, as in the images, the mean over directions"
-    return facts | {"spacing": lattice.spacing[0], "colors": colors}
+    return facts | {"spacing": lattice.spacing[0] / world.scale, "colors": colors}

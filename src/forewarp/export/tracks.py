@@ -7,7 +7,7 @@ makes them one binary glTF 2.0 file with an animation.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +23,7 @@ from forewarp.scene.camera import Camera, mean_up
 from forewarp.scene.cloud import far_apart
 from forewarp.scene.frame import spread
 from forewarp.scene.view import Moment, View
+from forewarp.scene.world import SAME, World
 from forewarp.training.module import DynamicSceneModule
 
 Progress = Callable[[int, int], None]  # the number of times done, and of how many
@@ -43,6 +44,7 @@ class Source:
     [0, 1], the ``background`` (3,) in [0, 1] of its images, the scene's ``name``, and, if known,
     ``image_times``, when each camera took its image. Of a film in windows it is the first one, whose time 0
     and 1 are those of the film in ``span``; ``later`` are the others, each shown from its ``begin`` on.
+    ``world`` is where all of this lies in the world of the data.
     """
 
     module: DynamicSceneModule
@@ -55,11 +57,22 @@ class Source:
     span: tuple[float, float] = (0.0, 1.0)
     begin: float = 0.0
     later: Sequence[Source] = ()
+    world: World = SAME
 
     @property
     def method(self) -> Method:
         """The fitted method."""
         return self.module.method
+
+    @property
+    def shift(self) -> tuple[float, float, float]:
+        """What files leave out of the data's coordinates; see ``World.shift``."""
+        return self.world.shift(max((camera.far for camera in self.cameras), default=1.0))
+
+    @property
+    def in_files(self) -> World:
+        """Where the scene lies in its files: in the world of the data, less the ``shift``."""
+        return self.world.without(self.shift)
 
     @property
     def has_ellipsoids(self) -> bool:
@@ -115,6 +128,11 @@ class Tracks:
 
     def __len__(self) -> int:
         return len(self.points)
+
+    def in_data(self, world: World) -> Tracks:
+        """Move the points from a scene's world to that of its data."""
+        points, positions = (world.to_data(places).float() for places in (self.points, self.positions))
+        return replace(self, points=points, positions=positions, size=self.size / world.scale)
 
 
 @torch.no_grad()
@@ -172,12 +190,14 @@ def export_npz(source: Source, folder: Path, progress: Progress, *, points: int,
     Returns:
         the facts for ``about.json``.
     """
-    tracks = tracks_of(source, points)
+    tracks, world = tracks_of(source, points), source.in_files
     numbers = spread(len(source.cameras), views)
     cameras = [source.cameras[i] for i in numbers]
     visible = visibility(source, tracks, cameras, progress)
+    tracks, poses = tracks.in_data(world), [world.to_data(camera.camera_to_world) for camera in cameras]
     np.savez_compressed(
         folder / "trajectories.npz",
+        shift=np.array(source.shift),
         canonical_time=np.float32(source.module.curriculum.canonical_time),
         points=tracks.points.numpy(),
         times=tracks.times.numpy(),
@@ -186,7 +206,7 @@ def export_npz(source: Source, folder: Path, progress: Progress, *, points: int,
         opacity=tracks.opacity.expand(len(tracks.times), -1).T.numpy(),
         visible=visible.numpy(),
         cameras=np.array(numbers),
-        camera_to_world=torch.stack([c.camera_to_world.double() for c in cameras]).numpy(),
+        camera_to_world=torch.stack(poses).numpy(),
         intrinsics=np.array([[[c.fx, c.skew, c.cx], [0, c.fy, c.cy], [0, 0, 1]] for c in cameras]),
         image_size=np.array([[c.width, c.height] for c in cameras]),
         lens=np.array([(0.0,) * 5 if c.lens is None else (*c.lens.k, *c.lens.p) for c in cameras]),
@@ -243,9 +263,9 @@ def export_gltf(source: Source, folder: Path, progress: Progress, *, points: int
     Returns:
         the facts for ``about.json``.
     """
-    tracks = tracks_of(source, points, progress)
+    tracks = tracks_of(source, points, progress).in_data(source.in_files)
     radius = _RADIUS * neighbour_distance(tracks.points, tracks.size)
-    (folder / "points.glb").write_bytes(glb(tracks, radius, source.rotation_to("y"), seconds))
+    (folder / "points.glb").write_bytes(glb(tracks, radius, source.rotation_to("y"), seconds, source.shift))
     axes = "y up, by the turn of its only node; places before it are the data's"
     facts = {"points": len(tracks), "radius": radius, "seconds": seconds, "axes in the file": axes}
     return facts | {"colors": "linear, as glTF asks; unlit"}
@@ -266,7 +286,9 @@ def linear(colors: Tensor) -> Tensor:
     return torch.where(colors <= 0.04045, colors / 12.92, ((colors + 0.055) / 1.055) ** 2.4)
 
 
-def glb(tracks: Tracks, radius: float, rotation: Tensor, seconds: float) -> bytes:
+def glb(
+    tracks: Tracks, radius: float, rotation: Tensor, seconds: float, shift: Sequence[float] = ()
+) -> bytes:
     """Make a binary glTF: each point is a small tetrahedron, as few programs draw mere points.
 
     Its corners at the first time are the mesh; every later time is a morph target. The animation lets weights
@@ -278,6 +300,7 @@ def glb(tracks: Tracks, radius: float, rotation: Tensor, seconds: float) -> byte
         radius: of a tetrahedron, world units.
         rotation: (3, 3) of the scene's only node.
         seconds: duration of the animation from time 0 to time 1.
+        shift: (3,) that was left out of all places.
     """
     total = len(tracks.times)
     opacity = tracks.opacity / tracks.opacity.amax(0).clamp(min=1e-6)
@@ -303,10 +326,11 @@ def glb(tracks: Tracks, radius: float, rotation: Tensor, seconds: float) -> byte
         sampler = {"input": clock, "output": weights, "interpolation": "LINEAR"}
         channel = {"sampler": 0, "target": {"node": 0, "path": "weights"}}
         animation = {"animations": [{"name": "time", "samplers": [sampler], "channels": [channel]}]}
+    extras = {"extras": {"shift": list(shift)}} if any(shift) else {}
     unlit = {"extensions": {"KHR_materials_unlit": {}}, "pbrMetallicRoughness": {"metallicFactor": 0}}
     description = {
         "extensionsUsed": ["KHR_materials_unlit"],
-        "nodes": [{"mesh": 0, "rotation": quaternion_of(rotation), "name": "points"}],
+        "nodes": [{"mesh": 0, "rotation": quaternion_of(rotation), "name": "points"} | extras],
         "meshes": [mesh],
         "materials": [unlit],
     }

@@ -52,7 +52,7 @@ def export_usd(
     degree = min(degree, own_degree)
     clouds, total = [], len(source.times)
     for number, time in enumerate(source.times, 1):
-        clouds.append(samples(source.method.ellipsoids(time), rotation, degree))
+        clouds.append(samples(source.method.ellipsoids(time).in_data(source.in_files), rotation, degree))
         progress(number, total)
     for before, cloud in zip(clouds, clouds[1:]):  # the shorter way round
         flips = (before["orientations"] * cloud["orientations"]).sum(-1, keepdims=True) < 0
@@ -127,13 +127,13 @@ def samples(cloud: Ellipsoids, rotation: Tensor | None, degree: int) -> dict[str
 
 def off_between(source: Source) -> dict[str, float]:
     """Measure how far a straight way between samples leads from the run's own, halfway between two times:
-    world units, the largest distance and that which 99 % of the particles stay below.
+    the data's units, the largest distance and that which 99 % of the particles stay below.
     """
     centers = [source.method.ellipsoids(time).centers for time in source.times]
     away = [torch.zeros(1)]
     for times, ends in zip(pairwise(source.times), pairwise(centers)):
         middle = source.method.ellipsoids(sum(times) / 2).centers
         away.append((middle - sum(ends) / 2).norm(dim=-1).cpu())
-    distances = torch.cat(away)
+    distances = torch.cat(away) / source.world.scale
     # Not Tensor.quantile, which takes 16 million numbers at most.
     return {"largest": float(distances.max()), "99 %": float(np.quantile(distances.numpy(), 0.99))}

@@ -29,6 +29,7 @@ from forewarp.scene.brief import brief
 from forewarp.scene.camera import Camera
 from forewarp.scene.cloud import Cloud, Ellipsoids, nearest
 from forewarp.scene.view import Moment, Rendering, View
+from forewarp.scene.world import World
 
 # Of the camera's near plane, and at least of its far plane: closer particles would fill the image.
 _NEAR, _LEAST_NEAR = 0.1, 0.02
@@ -269,6 +270,17 @@ class MovingGaussians:
     def moves(self) -> bool:
         """Whether there is any motion."""
         return self.motion is not None
+
+    def in_data(self, world: World) -> MovingGaussians:
+        """Move them from a scene's world to that of its data; computed in float64, kept as they were."""
+        if world.is_same:
+            return self
+        motion = self.motion
+        if motion is not None:
+            positions = world.to_data(motion.positions).to(motion.positions)
+            motion = replace(motion, positions=positions, translations=motion.translations / world.scale)
+        means = world.to_data(self.means).to(self.means)
+        return replace(self, means=means, log_scales=self.log_scales - math.log(world.scale), motion=motion)
 
     def gaussians(self) -> Gaussians:
         """Return them as the operators read them: coefficients of one kind in one tensor."""

@@ -271,6 +271,7 @@ def _scene(container: Container) -> Contents:
         torch.tensor(motion.numbers("focus", 3, [0, 0, 0]), dtype=torch.float64),
         motion.number("seconds", 1e-3, 1e6, 4),
         tuple(motion.numbers("background", 3, [1, 1, 1])),
+        shift=tuple(description.parts("nodes")[number].part("extras", {}).numbers("shift", 3, [0, 0, 0])),
     )
     return Contents(gaussians, setting)
 

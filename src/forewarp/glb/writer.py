@@ -33,8 +33,8 @@ _TIMES = 64  # at which opacity over time is looked at
 class Setting:
     """What a page needs besides the Gaussians: ``cameras`` that have seen them, the first one to begin at;
     the ``rotation`` (3, 3) that makes y point upwards; the ``focus`` (3,) to turn about, world units; how
-    many ``seconds`` time lasts from 0 to 1; the ``background`` (3,), sRGB; and ``times``, when each camera
-    took its image, where that is known.
+    many ``seconds`` time lasts from 0 to 1; the ``background`` (3,), sRGB; ``times``, when each camera took
+    its image, where that is known; and the ``shift`` (3,) that was left out of all places, world units.
     """
 
     cameras: Sequence[Camera]
@@ -43,6 +43,7 @@ class Setting:
     seconds: float
     background: tuple[float, float, float]
     times: Sequence[float] = ()
+    shift: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
 
 def write(windows: Sequence[tuple[Window, Rows]], setting: Setting, quality: str, shared: int = 0) -> bytes:
@@ -72,6 +73,7 @@ def write(windows: Sequence[tuple[Window, Rows]], setting: Setting, quality: str
     for camera, time in zip(cameras, setting.times):
         camera["extras"]["time"] = time
     node = {"name": "scene", "rotation": quaternion_of(setting.rotation), "mesh": 0}
+    node |= {"extras": {"shift": list(setting.shift)}} if any(setting.shift) else {}
     nodes = [node | {"children": list(range(1, len(cameras) + 1))}]
     for number, camera in enumerate(setting.cameras):
         pose = camera.camera_to_world[:3, :3].double() * CAMERA_AXES

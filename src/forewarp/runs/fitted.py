@@ -39,6 +39,7 @@ from forewarp.scene.camera import Camera, Vector, focus_point, mean_up, tensor_o
 from forewarp.scene.cloud import Cloud
 from forewarp.scene.frame import Frame, Scene, spread
 from forewarp.scene.view import Moment, Rendering, View
+from forewarp.scene.world import World
 from forewarp.training.module import DynamicSceneModule
 from forewarp.training.stages import Run
 
@@ -192,6 +193,11 @@ class Fitted(Renderable):
     scene: Scene
 
     @property
+    def world(self) -> World:
+        """Where the scene lies in the world of its data: ``world.to_scene`` and ``world.to_data``."""
+        return self.scene.world
+
+    @property
     def folder(self) -> Path:
         """The run's folder."""
         return self.place
@@ -213,9 +219,11 @@ class SceneFile(Renderable):
 
     Attributes:
         seconds: how long time lasts from 0 to 1, as a player shows it.
+        world: where the file's places lie in the world of the data.
     """
 
     seconds: float
+    world: World
 
     @property
     def file(self) -> Path:
@@ -236,7 +244,8 @@ def open_file(file: Path, device: str = "cpu") -> SceneFile:
     held = read(file)
     method, setting = held.gaussians.to(device), held.setting
     background = torch.tensor(setting.background)
-    return SceneFile(method, "particles", file, list(setting.cameras), background, setting.seconds)
+    world, cameras = World(setting.shift), list(setting.cameras)
+    return SceneFile(method, "particles", file, cameras, background, setting.seconds, world)
 
 
 def opened(config: DictConfig, device: str | torch.device | None = None) -> tuple[Run, DynamicSceneModule]:

@@ -14,7 +14,7 @@ def brief(record) -> str:
     """Say in a line what a dataclass holds, as its ``__repr__``: an array by its shape, records by their
     number; None, nothing and functions are left out.
     """
-    held = {part.name: getattr(record, part.name) for part in fields(record)}
+    held = {part.name: getattr(record, part.name) for part in fields(record) if part.repr}
     texts = [
         f"{name}={_text(value)}"
         for name, value in held.items()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import permutations
 
@@ -13,6 +13,7 @@ from torch import Tensor
 from forewarp.ops.gaussians import FLAT, harmonics
 from forewarp.scene.box import Box
 from forewarp.scene.brief import brief
+from forewarp.scene.world import World
 
 _THINNEST = 1e-6  # of a Gaussian's longest axis: a map may have pressed it flat, and logarithms are taken
 
@@ -134,6 +135,14 @@ class Ellipsoids:
     def colors(self) -> Tensor:
         """Mean colours over all directions (N, 3), in [0, 1]."""
         return (0.5 + FLAT * self.harmonics[:, 0]).clamp(0, 1)
+
+    def in_data(self, world: World) -> Ellipsoids:
+        """Move them from a scene's world to that of its data; places and sizes are float64, unless both are
+        the same world.
+        """
+        if world.is_same:
+            return self
+        return replace(self, centers=world.to_data(self.centers), roots=self.roots.double() / world.scale)
 
     def turned(self, rotation: Tensor) -> Ellipsoids:
         """Turn all of them by a rotation (3, 3) about the origin; their colours turn with them."""

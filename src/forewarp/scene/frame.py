@@ -13,6 +13,7 @@ from forewarp.ops.grid import dilate
 from forewarp.scene.box import Box, Lattice
 from forewarp.scene.brief import brief
 from forewarp.scene.camera import Camera, focus_point
+from forewarp.scene.world import SAME, World
 
 
 @dataclass(frozen=True)
@@ -73,7 +74,7 @@ class Scene:
     ``box`` bounds everything visible; ``canonical_time`` in [0, 1]; ``has_alpha``: the images separate
     foreground from background; ``protocol`` says how numbers are measured, entries of None are left out;
     ``still`` (N, 3) float32: points that never move, world units, if known; ``held``: held-out frames, never
-    trained on.
+    trained on; ``world``: where the scene lies in the world of its data.
     """
 
     name: str
@@ -87,6 +88,7 @@ class Scene:
     protocol: dict = field(default_factory=dict)
     still: Tensor | None = None
     held: tuple[Frame, ...] = ()
+    world: World = field(default=SAME, repr=False)
 
     __repr__ = brief
 
