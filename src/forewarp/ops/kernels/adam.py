@@ -8,6 +8,7 @@ from functools import cache
 import numpy as np
 from numba import njit, prange
 
+from forewarp.ops.kernels.keeping import KEPT
 from forewarp.ops.kernels.lanes import floats_at, get_row, not_zero, put_row, room, root, row_of, where_bits
 
 _WORD = 64  # numbers that are treated together: a bit each says which
@@ -48,7 +49,7 @@ def _seen(gradient, start, count, width):
     return seen & first
 
 
-@njit(parallel=True, cache=True)
+@njit(parallel=True, cache=KEPT)
 def adam(table, rates, first, second, eps, bias):
     """A step of P parameters; see ``adam.adam_rows``.
 

@@ -7,6 +7,7 @@ import math
 import numpy as np
 from numba import njit, prange
 
+from forewarp.ops.kernels.keeping import KEPT
 from forewarp.ops.kernels.lanes import (
     exp,
     get_row,
@@ -36,7 +37,7 @@ def _linear(motion, m, out):
     return a, s
 
 
-@njit(cache=True)
+@njit(cache=KEPT)
 def pull(motion, places, by_maps, edges, weights, gradient, factor):
     """Add to ``gradient``, of the shape of ``motion``; returns the stiffness. See ``nodes.pull_nodes``."""
     linear, by_linear, apart, strain = np.empty(9), np.empty(9), np.empty(3), np.empty(3)
@@ -79,7 +80,7 @@ def pull(motion, places, by_maps, edges, weights, gradient, factor):
     return total
 
 
-@njit(cache=True)
+@njit(cache=KEPT)
 def carry(shift, rotation, basis, places, motion, maps):
     """Fill ``motion`` and ``maps`` (M, 12), as ``nodes.carry_nodes``; ``rotation`` may be empty."""
     linear = np.empty(9)
@@ -101,7 +102,7 @@ def carry(shift, rotation, basis, places, motion, maps):
             maps[m, 9 + r] = rest
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=KEPT, error_model="numpy")
 def spread(value, by_motion, basis, bend, gradient, factor, scale):
     """Fill ``gradient``, as ``value`` (M, K, C); returns the mean of b^2. See ``nodes.spread_nodes``."""
     total, count = 0.0, value.shape[0] * value.shape[2]
@@ -119,7 +120,7 @@ def spread(value, by_motion, basis, bend, gradient, factor, scale):
     return total / count
 
 
-@njit(parallel=True, cache=True)
+@njit(parallel=True, cache=KEPT)
 def weigh(shares, learned, weights, width):
     """Fill ``weights``; all are (N L,), L is ``width``, up to 16. See ``nodes.skin_weights``.
 

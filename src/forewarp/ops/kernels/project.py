@@ -10,6 +10,7 @@ import numpy as np
 from numba import njit, prange
 
 from forewarp.ops.gaussians import COLUMN, LEAST_LOG, SPLAT
+from forewarp.ops.kernels.keeping import KEPT
 from forewarp.ops.kernels.lanes import (
     NARROW,
     exp,
@@ -243,7 +244,7 @@ def _squared_reach(camera, ahead, beside, lens, determinant, opacity, log_opacit
     return where_above(np.float32(1e30) - determinant, zero, reach)
 
 
-@njit(parallel=True, cache=True)
+@njit(parallel=True, cache=KEPT)
 def project(
     means, log_scales, quaternions, opacity, colors, maps, links, weights, camera, color_basis, opacity_basis,
     out,
@@ -290,7 +291,7 @@ def project(
 # Back -------------------------------------------------------------------------------------------------------
 
 
-@njit(parallel=True, cache=True)
+@njit(parallel=True, cache=KEPT)
 def splat_gradients(splats, rows, ranks, sums, factor, gradients, pixel_gradient):
     """Turn sums over pixels (S, V, 16) of splats in the order of depth into ``factor`` times the gradients by
     the columns (V', 16) of ``rows``, whose places in that order are ``ranks``; V' is V or more, a multiple
@@ -467,7 +468,7 @@ def _transposed(m):
     return m[0], m[3], m[6], m[1], m[4], m[7], m[2], m[5], m[8]
 
 
-@njit(parallel=True, cache=True)
+@njit(parallel=True, cache=KEPT)
 def chain(
     means, log_scales, quaternions, opacity, colors, maps, links, weights, camera, color_basis, opacity_basis,
     splats, seen, gradients,

@@ -12,6 +12,7 @@ import numpy as np
 from numba import njit, prange
 
 from forewarp.ops.gaussians import COLUMN, LEAST_LOG, MOST, SIDE
+from forewarp.ops.kernels.keeping import KEPT
 from forewarp.ops.kernels.lanes import (
     add_sums,
     any_above,
@@ -131,7 +132,7 @@ def _single(spans, k):
     return spans[k, 1] - spans[k, 0] <= 1 or spans[k, 3] - spans[k, 2] <= 1
 
 
-@njit(parallel=True, cache=True)
+@njit(parallel=True, cache=KEPT)
 def sort_into_tiles(splats, order, across, down, shares):
     """The ``records`` (V, 10) of splats in an order, which of them each tile has to look at, from near to
     far (``entries``), and where each tile's begin.
@@ -206,7 +207,7 @@ def _alpha(records, i, column, y):
     return where_above(power, np.float32(LEAST_LOG), exp_down(power))
 
 
-@njit(cache=True)
+@njit(cache=KEPT)
 def _blend(records, entries, first, last, column, y, kept, deep):
     """Composite a tile's entries from near to far.
 
@@ -235,7 +236,7 @@ def _blend(records, entries, first, last, column, y, kept, deep):
     return through, red, green, blue, far, count
 
 
-@njit(cache=True)
+@njit(cache=KEPT)
 def _walk_back(records, entries, first, count, column, y, kept, by_color, far, behind, sums):
     """Add the gradients of a tile to ``sums``, from far to near.
 
@@ -266,7 +267,7 @@ def _walk_back(records, entries, first, count, column, y, kept, by_color, far, b
             add_sums(sums, i, (s, sx, sy, sx * dx, sy * dx, syy, *colors, fold(weight * far)))
 
 
-@njit(parallel=True, cache=True)
+@njit(parallel=True, cache=KEPT)
 def draw(records, entries, ends, shares, out):
     """Draw tiles into ``out`` (5, H', W'): colour without background, depth, what is let through.
 
@@ -285,7 +286,7 @@ def draw(records, entries, ends, shares, out):
             put_tile(out[4], row, column, through)
 
 
-@njit(parallel=True, cache=True)
+@njit(parallel=True, cache=KEPT)
 def pull(records, entries, ends, shares, gradients, kept, sums):
     """Gradients of ``draw``: ``gradients`` (5, H', W') by its five planes, into ``sums`` (S, V, 16); whatever
     was there before is gone.
@@ -311,7 +312,7 @@ def pull(records, entries, ends, shares, gradients, kept, sums):
 # Compare ---------------------------------------------------------------------------------------------------
 
 
-@njit(cache=True)
+@njit(cache=KEPT)
 def _residual(pixels, row, column, through, color, background, number, inside):
     """A channel's difference from the truth over the background, 0 outside the image."""
     alpha = get_channel(pixels, row, column, 3)
@@ -319,7 +320,7 @@ def _residual(pixels, row, column, through, color, background, number, inside):
     return (fma(through, background, color) - truth) * inside
 
 
-@njit(cache=True)
+@njit(cache=KEPT)
 def _score(residual, width, score):
     """The derivative of ``sqrt(e^2 + width^2) - width``; adds it and the squared error to ``score``."""
     squared = residual * residual
@@ -329,7 +330,7 @@ def _score(residual, width, score):
     return residual / far
 
 
-@njit(cache=True)
+@njit(cache=KEPT)
 def _score_depth(error, trust, width, score):
     """The derivative of ``trust (sqrt(e^2 + width^2) - width)``, which is added to ``score``."""
     far = root(error * error + width * width)
@@ -337,7 +338,7 @@ def _score_depth(error, trust, width, score):
     return trust * error / far
 
 
-@njit(parallel=True, cache=True)
+@njit(parallel=True, cache=KEPT)
 def compare(
     records, entries, ends, shares, pixels, wide, high, background, width, planes, deep, kept, sums, scores
 ):

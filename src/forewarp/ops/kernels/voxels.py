@@ -10,6 +10,8 @@ from __future__ import annotations
 import numpy as np
 from numba import njit, prange
 
+from forewarp.ops.kernels.keeping import KEPT
+
 # Grid ------------------------------------------------------------------------------------------------------
 
 
@@ -37,7 +39,7 @@ def _corner(i, fx, fy, fz):
     return a, b, c, (fx if a else 1 - fx), (fy if b else 1 - fy), (fz if c else 1 - fz)
 
 
-@njit(parallel=True, cache=True)
+@njit(parallel=True, cache=KEPT)
 def gather(values, index, points, fill, out):
     """out[p] = trilinear read of a sparse lattice; absent voxels read ``fill``."""
     channels = values.shape[1]
@@ -57,7 +59,7 @@ def gather(values, index, points, fill, out):
                     out[p, c] += w * fill[c]
 
 
-@njit(parallel=True, cache=True)
+@njit(parallel=True, cache=KEPT)
 def gather_backward_values(index, points, gradient, out):
     """out[chunk, row] += weight * gradient[p]; ``out`` holds one copy a chunk."""
     chunks, channels, total = out.shape[0], gradient.shape[1], points.shape[0]
@@ -73,7 +75,7 @@ def gather_backward_values(index, points, gradient, out):
                         out[chunk, row, c] += w * gradient[p, c]
 
 
-@njit(parallel=True, cache=True)
+@njit(parallel=True, cache=KEPT)
 def gather_backward_points(values, index, points, fill, gradient, out):
     """out[p] = gradient with respect to the point's lattice coordinate; 0 where clamped."""
     channels = values.shape[1]
@@ -105,7 +107,7 @@ def _floor(position):
     return x, y, z, position[0] - x, position[1] - y, position[2] - z
 
 
-@njit(cache=True)
+@njit(cache=KEPT)
 def number_touched(positions, index):
     """Number the voxels that a kernel touches, in lattice order, in ``index`` (-1 at first); return how many.
 
@@ -129,7 +131,7 @@ def number_touched(positions, index):
     return rows
 
 
-@njit(parallel=True, cache=True)
+@njit(parallel=True, cache=KEPT)
 def scatter(source, positions, index, out):
     """out[chunk, row] += b(u) (source[q], 1): the sums of the average splat, coverage in the last channel."""
     chunks, channels, total = out.shape[0], source.shape[1], positions.shape[0]
@@ -150,7 +152,7 @@ def scatter(source, positions, index, out):
                     out[chunk, row, channels] += w
 
 
-@njit(parallel=True, cache=True)
+@njit(parallel=True, cache=KEPT)
 def scatter_backward(source, positions, index, gradient, to_source, to_positions):
     """Compute the gradients of ``scatter`` with respect to values and positions."""
     channels = source.shape[1]
@@ -179,7 +181,7 @@ def scatter_backward(source, positions, index, gradient, to_source, to_positions
 # March -----------------------------------------------------------------------------------------------------
 
 
-@njit(cache=True)
+@njit(cache=KEPT)
 def _span(o, d, near, far, bounds):
     """Return the interval of a ray within ``bounds`` (2, 3); its end precedes its start if it misses."""
     t0, t1 = near, far
@@ -194,13 +196,13 @@ def _span(o, d, near, far, bounds):
     return t0, t1
 
 
-@njit(cache=True)
+@njit(cache=KEPT)
 def _first(t, near, step, jitter):
     """Return the first step at or after distance ``t``."""
     return max(int(np.ceil((t - near) / step - jitter)), 0)
 
 
-@njit(cache=True)
+@njit(cache=KEPT)
 def _leap(o, d, x, y, z, reach, block, end):
     """Return the distance at which a ray leaves the empty blocks around it, ``reach`` in all directions."""
     for axis in range(3):
@@ -213,7 +215,7 @@ def _leap(o, d, x, y, z, reach, block, end):
     return end
 
 
-@njit(cache=True)
+@njit(cache=KEPT)
 def _seek(o, d, k, near, step, jitter, end, cells, reach, block):
     """Return the next step from ``k`` on in an occupied cell, and its distance; beyond ``end`` if none."""
     nx, ny, nz = cells.shape
@@ -234,7 +236,7 @@ def _seek(o, d, k, near, step, jitter, end, cells, reach, block):
     return k, t
 
 
-@njit(cache=True)
+@njit(cache=KEPT)
 def pool_blocks(cells, reach, block, bounds):
     """Fill ``reach``, the chessboard distance of each block (``block`` cells a side) to the nearest occupied
     block, and ``bounds`` (2, 3) of the occupied cells, low > high if there are none.
@@ -254,7 +256,7 @@ def pool_blocks(cells, reach, block, bounds):
     _sweep(reach, -1)
 
 
-@njit(cache=True)
+@njit(cache=KEPT)
 def _sweep(reach, sign):
     """Sweep the chessboard distance transform, forwards or backwards."""
     nx, ny, nz = reach.shape
@@ -270,7 +272,7 @@ def _sweep(reach, sign):
         reach[x, y, z] = least
 
 
-@njit(cache=True)
+@njit(cache=KEPT)
 def _raw(raw, index, fill, x, y, z):
     """Interpolate one channel of a sparse lattice."""
     x0, y0, z0, fx, fy, fz = _cell((x, y, z), index)
@@ -282,7 +284,7 @@ def _raw(raw, index, fill, x, y, z):
     return total
 
 
-@njit(parallel=True, cache=True)
+@njit(parallel=True, cache=KEPT)
 def march(
     origins, directions, near, far, step, jitter, cells, reach, bounds, block, raw, index, fill,
     shift, scale, early_stop_eps, threshold, sums, read, counts, firsts, starts, ray_ids, distances, weights,
