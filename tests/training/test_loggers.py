@@ -6,11 +6,13 @@ import lightning
 import pytest
 import torch
 from lightning.pytorch.loggers import MLFlowLogger, TensorBoardLogger, WandbLogger
+from lightning.pytorch.utilities.rank_zero import rank_zero_only
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from forewarp.drawing.images import write_video
 from forewarp.files import read_json, read_rows
 from forewarp.training.callbacks import Scalars
+from forewarp.training.environment import SingleProcess
 from forewarp.training.loggers import CsvLogger, Labels, RunLoggers, redacted
 from tests.support.tiny_scene import Interrupt, make_run, stage
 
@@ -118,6 +120,36 @@ def test_a_run_outlives_a_tracker_that_fails(tmp_path, plain, capsys):
     told = [line for line in capsys.readouterr().err.splitlines() if line.startswith("warning: ")]
     assert told == ["warning: logger.bad failed and is left out from now on: ConnectionError: no route"]
     assert read_rows(tmp_path / "run" / "csv" / "metrics.csv")[-1]["test/all/psnr"] == "30.5"
+
+
+def test_a_run_of_another_rank_logs_all_the_same(tmp_path, plain, monkeypatch):
+    monkeypatch.setattr(rank_zero_only, "rank", 2)  # as SLURM_PROCID=2 would have it
+    with RunLoggers(plain, tmp_path) as loggers:
+        loggers.open()
+        loggers.log({"train/loss": 1.0}, 1)
+    assert [row["train/loss"] for row in read_rows(tmp_path / "csv" / "metrics.csv")] == ["1.0"]
+    assert SingleProcess().global_rank() == rank_zero_only.rank == 0
+
+
+def test_the_environment_of_a_run_heeds_no_variables(monkeypatch):
+    for name in ("LOCAL_RANK", "NODE_RANK", "GROUP_RANK", "WORLD_SIZE", "SLURM_NTASKS"):
+        monkeypatch.setenv(name, "3")
+    one = SingleProcess()
+    found = (one.local_rank(), one.node_rank(), one.global_rank(), one.world_size())
+    assert (*found, one.creates_processes_externally) == (0, 0, 0, 1, False)
+
+
+@pytest.mark.parametrize("name", ["tensorboard", "csv"])
+def test_a_tracker_that_holds_nothing_is_said(tmp_path, plain, capsys, name):
+    with RunLoggers(plain, tmp_path) as loggers:
+        loggers.open()
+        loggers.log({"train/loss": 1.0}, 1)
+        for file in (tmp_path / name).glob("*e*"):
+            file.unlink()
+    (said,) = capsys.readouterr().err.splitlines()
+    assert said.startswith(
+        f"warning: logger.{name} failed and is left out from now on: ValueError: expected what"
+    )
 
 
 def test_a_row_that_a_killed_run_left_half_written_is_dropped(tmp_path, plain):

@@ -226,6 +226,8 @@ def one_line(error: BaseException) -> str | None:
         advice = "lower stage.*.density, or with model=forward data.rays or stage.*.num_voxels, and run the "
         advice += "same command again"
         return f"memory: expected room for {wanted[1] if wanted else 'more'}, but got none; {advice}"
+    if isinstance(error, RuntimeError) and "home directory" in str(error):  # pathlib's
+        return "~: expected a user with a home folder, but got none; write the whole path"
     if isinstance(error, TypeError) and "unexpected keyword argument" in str(error):
         return f"config: {error}; leave that key out"
     if isinstance(error, ImportError):

@@ -129,7 +129,11 @@ def own_file() -> Path:
     """Return the file of this machine's jobs: the one that ``FOREWARP_TIMES`` names, else the user's."""
     if named := os.environ.get(FILE_VARIABLE):
         return Path(named).expanduser()
-    return Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser() / "forewarp" / "times.csv"
+    try:
+        cache = Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser()
+    except RuntimeError:  # a user without a home
+        cache = Path(os.devnull)  # in which nothing is read or written
+    return cache / "forewarp" / "times.csv"
 
 
 def read_costs(file: Path) -> list[Row]:

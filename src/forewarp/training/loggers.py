@@ -18,6 +18,7 @@ import yaml
 from filelock import FileLock
 from lightning.pytorch.loggers import CSVLogger, Logger, MLFlowLogger, TensorBoardLogger, WandbLogger
 from lightning.pytorch.loggers.csv_logs import ExperimentWriter
+from lightning.pytorch.utilities.rank_zero import rank_zero_only
 from tensorboard.compat.proto.summary_pb2 import Summary
 from torch import Tensor
 
@@ -90,7 +91,7 @@ class RunLoggers:
         hyperparameters: gives them by flat name, when something is first logged.
         labels: how trackers file the run.
 
-    As a context manager it closes them, as failed after an exception.
+    As a context manager it closes them, as failed after an exception, and warns of those that hold nothing.
     """
 
     def __init__(
@@ -106,6 +107,7 @@ class RunLoggers:
         self._open: dict[str, Logger] | None = None
         self._closing: list[Callable[[str], None]] = []
         self._failed: set[str] = set()
+        self._logged: set[str] = set()
         self.before = 0  # steps of the earlier stages
         for name, maker in self.makers.items():
             package = _PACKAGES.get(_class_of(maker), "lightning")
@@ -125,6 +127,7 @@ class RunLoggers:
             ValueError: if a tracker does not take the run.
         """
         self.before = before
+        rank_zero_only.rank = 0  # else a launcher's variables may silence them; see ``SingleProcess``
         if self._open is None:
             self._open, ids = {}, read_json(self.folder / IDS) or {}
             for name, maker in self.makers.items():
@@ -171,6 +174,7 @@ class RunLoggers:
 
         def log_on_the_runs_axis(metrics: Mapping[str, float], step: int | None = None) -> None:
             step = None if step is None else step + self.before
+            self._logged.add(name)
             self._guard(name, log_metrics, metrics, step)
 
         logger.finalize = lambda status: self._guard(name, logger.save)  # Lightning's, after each stage
@@ -247,6 +251,8 @@ class RunLoggers:
         """Close all loggers, as failed after an exception."""
         for (name, logger), close in zip((self._open or {}).items(), self._closing):
             self._guard(name, close, "success" if kind is None else "failed")
+            if name in self._logged:
+                self._guard(name, _check_written, logger)
             if isinstance(logger, WandbLogger):  # else the next job of a sweep would go on in this run
                 self._guard(name, logger.experiment.finish, exit_code=0 if kind is None else 1)
         self._open, self._closing = None, []
@@ -302,6 +308,20 @@ def _log_film(logger: Logger, title: str, file: Path, step: int) -> None:
         logger.experiment.log_artifact(logger.run_id, str(file), title)
     elif isinstance(logger, WandbLogger):
         logger.log_video(title, [str(file)], step=step, format=["gif"])
+
+
+def _check_written(logger: Logger) -> None:
+    """Raise ValueError if a tracker holds nothing of what was logged; another kind than these is trusted."""
+    if isinstance(logger, TensorBoardLogger):
+        written = any(Path(logger.log_dir).glob("events.out.tfevents.*"))
+    elif isinstance(logger, CSVLogger):
+        written = (Path(logger.log_dir) / ExperimentWriter.NAME_METRICS_FILE).is_file()
+    elif isinstance(logger, MLFlowLogger):
+        written = bool(logger.experiment.get_run(logger.run_id).data.metrics)
+    else:
+        written = not getattr(logger.experiment, "disabled", False)  # by WANDB_MODE
+    if not written:
+        raise ValueError("expected what was logged, but it holds nothing; look for what switches it off")
 
 
 def _class_of(maker: Callable[..., Logger]) -> type:
