@@ -127,6 +127,32 @@ def test_one_process_trains_a_run(devices, nodes, got):
             build.check_trainer(trainer)
 
 
+@pytest.mark.parametrize("precision", ["64-true", 64, "bf16-true"])
+def test_only_precisions_that_are_tested_are_taken(precision):
+    text = f"trainer.precision: expected 32-true or bf16-mixed.*, but got {precision}; use trainer.precision="
+    with pytest.raises(ValueError, match=text):
+        build.check_trainer(OmegaConf.create({"precision": precision}))
+    for known in (None, 32, "32-true", "bf16-mixed"):
+        build.check_trainer(OmegaConf.create({"precision": known}))
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "says"),
+    [
+        ("max_steps", 5, "trainer.max_steps: expected one of accelerator, .*; use budget.iterations=N"),
+        ("gradient_clip_val", 1.0, "trainer.gradient_clip_val: expected one of .*; leave it out"),
+        (
+            "strategy",
+            "ddp",
+            "trainer.devices: expected 1, .* but got 1 with strategy=ddp; one process",
+        ),
+    ],
+)
+def test_an_argument_of_the_trainer_that_would_be_overruled_is_refused(key, value, says):
+    with pytest.raises(ValueError, match=says):
+        build.check_trainer(OmegaConf.create({"_target_": "lightning.Trainer", key: value}))
+
+
 def test_a_profiler_of_another_name_is_refused():
     with pytest.raises(ValueError, match="profiler: expected simple, advanced or null, but got 'slow'"):
         build.build_run(config_of("+trainer.profiler=slow"))

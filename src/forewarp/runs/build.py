@@ -36,6 +36,7 @@ from forewarp.runs.overrides import constant, key_of, typed_overrides
 from forewarp.scene.cloud import Handover
 from forewarp.training.callbacks import StageProgress
 from forewarp.training.checkpoints import load_handover
+from forewarp.training.environment import SingleProcess
 from forewarp.training.loggers import Labels, RunLoggers, redacted
 from forewarp.training.module import DynamicSceneModule
 from forewarp.training.schedule import StagePlan, seconds_after, share_out
@@ -46,6 +47,28 @@ PROFILERS = {"simple": SimpleProfiler, "advanced": AdvancedProfiler}  # Lightnin
 _LEVELS = 4  # that a run may lie below the folder of all runs
 _FOLLOWS = re.compile(r"\$\{(\w[\w.]*)\}")  # one key that has the value of another one
 _PLACES = re.compile(r"data\.root|paths\.|trainer\.(accelerator|devices)")  # where, not what
+_PRECISIONS = ("None", "32", "32-true", "bf16", "bf16-mixed")
+# Arguments of Lightning's trainer that a config may set, and what to type in place of others.
+_TRAINER = (
+    "_target_",
+    "_partial_",
+    "accelerator",
+    "devices",
+    "num_nodes",
+    "strategy",
+    "precision",
+    "profiler",
+)
+_TRAINER += ("benchmark", "deterministic", "detect_anomaly")
+_INSTEAD = dict.fromkeys(("max_steps", "max_epochs", "min_steps", "min_epochs"), "use budget.iterations=N")
+_INSTEAD |= {
+    "max_time": "use budget.minutes=N",
+    "callbacks": "use +callbacks.NAME",
+    "logger": "use logger=NAME",
+}
+_INSTEAD |= dict.fromkeys(
+    ("fast_dev_run", "limit_train_batches", "overfit_batches"), "use debug=fast or overfit"
+)
 PROFILE = "profile"  # of a file's name: fit-profile.txt
 
 
@@ -73,8 +96,9 @@ def build_run(config: DictConfig) -> Run:
         own["profiler"] = profiler and profiler(dirpath=str(folder), filename=PROFILE)
         off = dict.fromkeys(("enable_checkpointing", "enable_progress_bar", "enable_model_summary"), False)
         off |= {"limit_val_batches": 0, "num_sanity_val_steps": 0}
+        off |= {"max_epochs": 1, "max_steps": -1, "plugins": [SingleProcess()]}
         # With auto, Lightning would choose a Mac's GPU, which lacks float64.
-        return trainer(accelerator=device().type, max_epochs=1, max_steps=-1, **own, **off)
+        return trainer(accelerator=device().type, **own, **off)
 
     def make_callbacks(name: str, folder: Path) -> list:
         callbacks = [make() for make in factories]
@@ -270,22 +294,32 @@ def stage_of(name: str, config: DictConfig) -> StagePlan:
 
 
 def check_trainer(trainer: DictConfig) -> None:
-    """Refuse a precision and a number of processes with which no run can be trained.
+    """Refuse arguments of Lightning's trainer with which no run can be trained, or that other keys stand for.
 
-    Float16 does not hold an inpainter's gradients over constant volumes. One process trains a run, as the
-    run's folder and its clock are those of one process.
+    Float16 does not hold an inpainter's gradients over constant volumes, and no method is tested in other
+    precisions. One process trains a run, as the run's folder and its clock are those of one process.
 
     Raises:
         ValueError: naming the key.
     """
+    of_lightning = str(trainer.get("_target_")).startswith("lightning.")
+    for key in trainer:
+        if of_lightning and key not in _TRAINER:
+            known = f"one of {', '.join(name for name in _TRAINER if name[0] != '_')}"
+            raise mismatch(f"trainer.{key}", known, "another argument", _INSTEAD.get(key, "leave it out"))
     precision = trainer.get("precision")
-    if "16" in str(precision) and "bf16" not in str(precision):
-        expected = "trainer.precision: expected 32-true or bf16-mixed, as float16 does not hold the gradients"
-        raise ValueError(f"{expected}, but got {precision}; use trainer.precision=bf16-mixed")
+    if str(precision) not in _PRECISIONS:
+        is_half = "16" in str(precision)
+        why = ", as float16 does not hold the gradients" if is_half else ""
+        advice = f"use trainer.precision={'bf16-mixed' if is_half else '32-true'}"
+        raise ValueError(
+            f"trainer.precision: expected 32-true or bf16-mixed{why}, but got {precision}; {advice}"
+        )
     devices, nodes = trainer.get("devices", 1), str(trainer.get("num_nodes", 1))
     count = len(devices) if OmegaConf.is_list(devices) or isinstance(devices, list | tuple) else devices
-    if (str(count), nodes) != ("1", "1"):
+    if (str(count), nodes) != ("1", "1") or trainer.get("strategy", "auto") != "auto":
         got = f"{devices}" if nodes == "1" else f"{devices} on {nodes} nodes"
+        got += "" if trainer.get("strategy", "auto") == "auto" else f" with strategy={trainer.strategy}"
         advice = "one process trains a run, --multirun launcher=joblib trains several at once"
         raise mismatch("trainer.devices", "1, or the number of one GPU as [0]", got, advice)
 
