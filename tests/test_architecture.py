@@ -7,10 +7,10 @@ from pathlib import Path
 import pytest
 
 SOURCE = Path(__file__).parents[1] / "src" / "forewarp"
-BOTTOM = {"clock", "files", "progress", "provenance"}  # open to all
+BOTTOM = {"clock", "files", "interrupts", "progress", "provenance"}  # open to all
 LOWER = {"ops", "scene", "losses", "metrics", "fields", "drawing", "renderer"}
 MAY_IMPORT = {
-    **dict.fromkeys(["clock", "files", "progress", "provenance", "ops"], set()),
+    **dict.fromkeys(["clock", "files", "interrupts", "progress", "provenance", "ops"], set()),
     "scene": {"ops"},
     "losses": {"ops"},
     **dict.fromkeys(["metrics", "drawing", "fields", "data"], {"ops", "scene"}),

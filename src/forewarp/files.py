@@ -13,7 +13,7 @@ import shutil
 import stat
 import time
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from reprlib import repr as short
@@ -63,6 +63,30 @@ def written_whole(path: Path, *, synced: bool = False) -> Iterator[Path]:
     finally:
         with suppress(OSError):
             beside.unlink()
+
+
+@contextmanager
+def held(folder: Path) -> Iterator[Callable[[], None]]:
+    """Watch a folder within the block; yields what refuses to go on once it is not there any more.
+
+    What is written later would otherwise make a new folder, which holds a part of what belongs into it.
+
+    Raises:
+        ValueError: by what is yielded, if the folder was deleted or moved, or another took its place.
+    """
+    descriptor = os.open(folder, os.O_RDONLY)  # while it is open, no other folder gets its number
+
+    def check() -> None:
+        with suppress(FileNotFoundError):
+            if os.path.samestat(os.fstat(descriptor), folder.stat()):
+                return
+        expected = f"{folder}: expected the folder that this run works in"
+        raise ValueError(f"{expected}, but it was deleted or moved meanwhile; run the same command again")
+
+    try:
+        yield check
+    finally:
+        os.close(descriptor)
 
 
 @contextmanager

@@ -5,6 +5,7 @@ import os
 import platform
 import shlex
 import shutil
+import signal
 from importlib.metadata import version
 from pathlib import Path
 from types import SimpleNamespace
@@ -69,6 +70,16 @@ def test_every_command_runs_as_a_module_too(name):
 
 def test_the_version_is_forewarps(ok):
     assert ok("report", "--version").out == f"forewarp {version('forewarp')}\n"
+
+
+def test_variables_of_launchers_decide_nothing(monkeypatch):
+    of_others = {"PL_TRAINER_MAX_STEPS": "1", "RANK": "", "LOCAL_RANK": "x", "SLURM_PROCID": "2"}
+    for name, value in of_others.items():
+        monkeypatch.setenv(name, value)
+    entry.drop_launchers()
+    left = [name for name in os.environ if name.startswith("PL_TRAINER") or name in ("RANK", "LOCAL_RANK")]
+    assert left == []
+    assert os.environ["SLURM_PROCID"] == "2"  # launchers of sweeps need it; ``SingleProcess`` is of rank 0
 
 
 def test_missing_conf_is_named(refused, monkeypatch, in_tmp):
@@ -227,10 +238,16 @@ def test_a_bug_keeps_its_traceback(forewarp, monkeypatch, in_tmp):
 
 
 @pytest.mark.parametrize("by", ["ctrl-c", "lightning"])
-def test_interruption_says_how_to_go_on(forewarp, monkeypatch, in_tmp, by):
+@pytest.mark.parametrize(
+    ("number", "status", "says"),
+    [(signal.SIGINT, 130, "interrupted"), (signal.SIGTERM, 143, "ended by SIGTERM")],
+)
+def test_interruption_says_how_to_go_on(forewarp, monkeypatch, in_tmp, by, number, status, says):
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+
     def interrupted(config):
         try:
-            raise KeyboardInterrupt
+            signal.raise_signal(number)
         except KeyboardInterrupt:
             if by == "lightning":  # exits by itself
                 raise SystemExit(1)  # noqa: B904
@@ -238,8 +255,10 @@ def test_interruption_says_how_to_go_on(forewarp, monkeypatch, in_tmp, by):
 
     monkeypatch.setattr("forewarp.cli.train.train", interrupted)
     done = forewarp("train")
-    assert done.status == 130
-    assert "forewarp-train: interrupted; run the same command again" in done.err
+    assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
+    signal.signal(signal.SIGINT, before)
+    assert done.status == status
+    assert f"forewarp-train: {says}; run the same command again" in done.err
     assert "Traceback" not in done.err
 
 

@@ -9,7 +9,7 @@ from filelock import FileLock
 from omegaconf import OmegaConf
 
 from forewarp.data.files import LOCK
-from forewarp.runs.session import check_data, claim, locked, warn_if_changed
+from forewarp.runs.session import check_data, claim, locked, session, warn_if_changed
 
 
 @pytest.mark.parametrize("holder", [None, b"", b"\xff\xfe\x00", b"x" * 5000])
@@ -31,6 +31,36 @@ def test_a_folder_that_cannot_be_written_names_the_key(tmp_path):
     assert str(caught.value.filename).startswith("run: ")
     with locked(tmp_path / "run"):
         pass
+
+
+def watched(tmp_path):
+    """A session of a run over a scene of two files, without a config to claim."""
+    scene, folder = tmp_path / "scene", tmp_path / "run"
+    scene.mkdir()
+    for name in "ab":
+        (scene / f"{name}.png").write_bytes(b"1")
+    data = SimpleNamespace(place=scene, fingerprint=lambda: None)
+    return session(SimpleNamespace(folder=folder, datamodule=data), OmegaConf.create(), finished=True)
+
+
+def test_images_exchanged_while_a_run_works_are_said(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("forewarp.runs.session.claim", lambda config, finished: None)
+    with watched(tmp_path):
+        a, b = (tmp_path / "scene" / f"{name}.png" for name in "ab")
+        a.write_bytes(b"2")  # as many bytes
+        b.unlink()
+    assert "scene: expected files that stay as they are" in (said := capsys.readouterr().err)
+    assert "got others: a.png, b.png; what was trained" in said
+
+
+def test_a_folder_that_is_moved_while_a_run_works_is_said(tmp_path, monkeypatch):
+    monkeypatch.setattr("forewarp.runs.session.claim", lambda config, finished: None)
+    working = watched(tmp_path)
+    working.__enter__()
+    (tmp_path / "run").rename(tmp_path / "elsewhere")
+    (tmp_path / "run").mkdir()
+    with pytest.raises(ValueError, match="run: expected the folder that this run works in"):
+        working.__exit__(None, None, None)
 
 
 def test_a_file_system_without_locks_is_used_without(tmp_path, monkeypatch):

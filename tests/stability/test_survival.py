@@ -255,16 +255,18 @@ def test_starved_halfway_a_run_keeps_its_checkpoint_and_goes_on(begin, tmp_path)
     assert read(last)["global_step"] > step
 
 
-def test_an_interruption_keeps_the_last_checkpoint(zygote, begin, scenes, whole, tmp_path):
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_an_interruption_keeps_the_last_checkpoint(zygote, begin, scenes, whole, tmp_path, number):
     folder, log = tmp_path / "run", tmp_path / "log.txt"
     pid = zygote.start([*SMALL, f"data.root={scenes}", f"run={folder}"], log)
     deadline = time.perf_counter() + 60
     while not (folder / "coarse" / "last.ckpt").is_file() and time.perf_counter() < deadline:
         time.sleep(0.01)
-    os.kill(pid, signal.SIGINT)
-    assert zygote.status() == 130, log.read_text()
+    os.kill(pid, number)
+    assert zygote.status() == 128 + number, log.read_text()
     said = log.read_text()
-    assert "forewarp-train: interrupted; run the same command again to go on from the last checkpoint" in said
+    ended = "interrupted" if number == signal.SIGINT else "ended by SIGTERM"
+    assert f"forewarp-train: {ended}; run the same command again to go on from the last checkpoint" in said
     assert "Traceback" not in said
     goes_on(begin, folder, whole)
 

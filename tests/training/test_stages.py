@@ -11,6 +11,7 @@ import lightning
 import pytest
 import torch
 
+from forewarp.interrupts import ENDING, signal_of
 from forewarp.training import stages as stages_module
 from forewarp.training.checkpoints import KeepCheckpoint
 from tests.support import tiny_scene as tiny
@@ -200,15 +201,15 @@ def test_a_scene_of_one_time_needs_no_motion_and_no_rate_for_it(tmp_path):
 
 
 class CtrlC(lightning.Callback):
-    """Press Ctrl-C once or more in the middle of a step."""
+    """Press Ctrl-C once or more in the middle of a step, or send another signal."""
 
-    def __init__(self, stage, step, times=1):
-        self.stage, self.step, self.times = stage, step, times
+    def __init__(self, stage, step, times=1, number=signal.SIGINT):
+        self.stage, self.step, self.times, self.number = stage, step, times, number
 
     def on_before_backward(self, trainer, module, loss):
         if module.settings.name == self.stage and module.global_step == self.step:
             for _ in range(self.times):
-                signal.raise_signal(signal.SIGINT)
+                signal.raise_signal(self.number)
 
 
 @pytest.fixture(autouse=True)
@@ -220,23 +221,26 @@ def _listening():
 
 
 def pressed(folder, *presses):
-    """Run until Ctrl-C ends it; Lightning turns KeyboardInterrupt into SystemExit."""
-    before = signal.getsignal(signal.SIGINT)
+    """Run until a signal ends it; Lightning turns KeyboardInterrupt into SystemExit."""
+    before = [signal.getsignal(number) for number in ENDING]
     with pytest.raises(SystemExit) as leaving:
         run(folder, [CtrlC(*presses)]).fit()
-    assert isinstance(leaving.value.__context__, KeyboardInterrupt)
-    assert signal.getsignal(signal.SIGINT) is before
+    assert [signal.getsignal(number) for number in ENDING] == before
+    return signal_of(leaving.value.__context__)
 
 
 ENDED = "fine: ended after 10 steps, 0.833333 for each of 12 training pictures; for as many as the budget "
 ENDED += "has: stage.fine.steps_per_picture=null"
 
 
-@pytest.mark.parametrize(("name", "step"), [("coarse", 5), ("fine", 9)])
-def test_ctrl_c_keeps_the_step_that_it_met(tmp_path, whole, capsys, name, step):
-    pressed(tmp_path, name, step)
+@pytest.mark.parametrize(
+    ("name", "step", "number"), [("coarse", 5, signal.SIGINT), ("fine", 9, signal.SIGTERM)]
+)
+def test_a_request_to_end_keeps_the_step_that_it_met(tmp_path, whole, capsys, name, step, number):
+    assert pressed(tmp_path, name, step, 1, number) == number
     assert torch.load(tmp_path / name / "last.ckpt", weights_only=True)["global_step"] == step + 1
-    assert "ends this step and saves it; Ctrl-C again stops at once" in capsys.readouterr().err
+    again = "Ctrl-C" if number == signal.SIGINT else "SIGTERM"
+    assert f"ends this step and saves it; {again} again stops at once" in capsys.readouterr().err
     ours, told = run(tmp_path), []
     ours.tell = told.append
     assert tiny.same(ours.fit(), whole[1])
@@ -244,9 +248,21 @@ def test_ctrl_c_keeps_the_step_that_it_met(tmp_path, whole, capsys, name, step):
     assert told == [*before, f"{name}: goes on at {10 * (step + 1)}%, step {step + 1}", ENDED]
 
 
-def test_a_second_ctrl_c_stops_at_once(tmp_path):
-    pressed(tmp_path, "coarse", 5, 2)
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_second_request_to_end_stops_at_once(tmp_path, number):
+    assert pressed(tmp_path, "coarse", 5, 2, number) == number
     assert not (tmp_path / "coarse" / "last.ckpt").exists()
+
+
+def test_a_folder_that_is_deleted_while_a_run_works_in_it_is_said(tmp_path):
+    class Deleted(lightning.Callback):
+        def on_train_end(self, trainer, module):
+            shutil.rmtree(tmp_path / "coarse")
+            (tmp_path / "coarse").mkdir()  # as whoever writes an image would
+
+    with pytest.raises(ValueError, match="coarse: expected the folder that this run works in, but it was"):
+        run(tmp_path, [Deleted()]).fit()
+    assert list((tmp_path / "coarse").iterdir()) == []
 
 
 def test_ctrl_c_that_no_step_follows_stops_before_the_next_stage(tmp_path, whole):

@@ -7,6 +7,7 @@ import json
 import logging
 import os
 import re
+import signal
 import sys
 import tempfile
 import traceback
@@ -17,13 +18,15 @@ from pathlib import Path
 
 import forewarp
 from forewarp.cli.mistakes import flat, one_line, options_last, refuse_dashes, unknown_key, with_run_key
+from forewarp.interrupts import listening, signal_of
 from forewarp.runs import overrides
 from forewarp.runs.config_files import configurations, installed, project_root
 from forewarp.runs.overrides import as_text, command_of_job, is_sweep, key_of
 from forewarp.runs.windows import commands_of, scores_of
 
 TRACEBACK_VARIABLE = "FOREWARP_TRACEBACK"
-MISTAKE, INTERRUPTED = 2, 130
+MISTAKE = 2
+INTERRUPTED = 128  # and the number of the signal
 _MMAP_THRESHOLD, _TRIM_THRESHOLD = -3, -1  # of mallopt, in glibc's malloc.h
 
 
@@ -31,7 +34,8 @@ def command(name: str, task: Callable, text: str, *, config: str | None = None) 
     """Run a console script: compose ``conf/<config>.yaml`` with the command line and call ``task`` with it.
 
     Never returns. The exit status is 0; 2 after a mistake of the user's, which is told in one line; 1 after a
-    bug, with its traceback; 130 after Ctrl-C. ``FOREWARP_TRACEBACK=1`` always shows the traceback.
+    bug, with its traceback; 130 after Ctrl-C, 143 after SIGTERM, 129 after SIGHUP. ``FOREWARP_TRACEBACK=1``
+    always shows the traceback.
 
     Args:
         name: the command's name after ``forewarp-``.
@@ -53,19 +57,20 @@ def command(name: str, task: Callable, text: str, *, config: str | None = None) 
             logging.raiseExceptions = False  # of a reader that closed the output
         failures: list[int] = []
         words = arguments_of(name, sys.argv[1:])
-        for sys.argv[1:] in commands_of(words) if name == "train" else [words]:
-            failures += _run(name, task, configurations(), config)
-            if any(failures):
-                break
-    except KeyboardInterrupt:
-        _interrupted(name)
+        with listening():
+            for sys.argv[1:] in commands_of(words) if name == "train" else [words]:
+                failures += _run(name, task, configurations(), config)
+                if any(failures):
+                    break
+    except KeyboardInterrupt as interruption:
+        sys.exit(interrupted(name, interruption))
     except BrokenPipeError:  # the reader of the output closed it
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(0)
     except SystemExit as leaving:
         # Lightning turns Ctrl-C into its own exit.
         if isinstance(leaving.__context__, KeyboardInterrupt):
-            _interrupted(name)
+            sys.exit(interrupted(name, leaving.__context__))
         raise
     except Exception as error:
         failures = [_tell(name, error, config)]
@@ -101,6 +106,7 @@ def quiet() -> None:
     _keep_memory()
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # Ray would report usage to its makers
+    drop_launchers()
     # Lets Hydra raise errors instead of printing them.
     os.environ["HYDRA_FULL_ERROR"] = "1"
     logging.disable(logging.INFO)
@@ -119,6 +125,16 @@ def wait_briefly() -> None:
     """
     if os.environ.setdefault("OMP_WAIT_POLICY", "passive").lower() == "passive":
         os.environ.setdefault("GOMP_SPINCOUNT", "10000")
+
+
+def drop_launchers() -> None:
+    """Leave out variables that would decide in a command's place: Lightning takes arguments of its trainer
+    from some, and cannot be imported beside a rank that is no number.
+    """
+    for name, value in list(os.environ.items()):
+        is_rank = name in ("RANK", "LOCAL_RANK", "SLURM_PROCID", "JSM_NAMESPACE_RANK")
+        if name.startswith("PL_TRAINER_") or (is_rank and not value.isdecimal()):
+            del os.environ[name]
 
 
 def _keep_memory() -> None:
@@ -207,10 +223,13 @@ def _tell(name: str, error: Exception, config_name: str) -> int:
     return 1 if line is None else MISTAKE
 
 
-def _interrupted(name: str) -> None:
-    say = "run the same command again" + (" to go on from the last checkpoint" if name == "train" else "")
-    print(f"\nforewarp-{name}: interrupted; {say}", file=sys.stderr)
-    sys.exit(INTERRUPTED)
+def interrupted(name: str, interruption: KeyboardInterrupt) -> int:
+    """Say what ended a command and how to go on; return the exit status, 128 and the number of the signal."""
+    number = signal_of(interruption)
+    ended = "interrupted" if number == signal.SIGINT else f"ended by {number.name}"
+    way = {"train": " to go on from the last checkpoint", "reproduce": " to go on"}.get(name, "")
+    print(f"\nforewarp-{name}: {ended}; run the same command again{way}", file=sys.stderr)
+    return INTERRUPTED + number
 
 
 def choices(conf: Path, name: str) -> str:

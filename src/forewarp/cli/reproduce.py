@@ -51,9 +51,10 @@ from types import SimpleNamespace
 
 import yaml
 
-from forewarp.cli.entry import INTERRUPTED, MISTAKE, arguments_of, project_root
+from forewarp.cli.entry import INTERRUPTED, MISTAKE, arguments_of, interrupted, project_root
 from forewarp.cli.mistakes import flat, one_line
 from forewarp.data.files import one_of
+from forewarp.interrupts import listening
 from forewarp.runs import overrides
 from forewarp.runs.config_files import configurations
 from forewarp.runs.overrides import key_of, merged
@@ -391,6 +392,7 @@ def cost_of(job: Job, *, listed: bool = False) -> list[str]:
 
 KINDS = demo, tables, ablations, accuracy_time, price_list, effects, gpu
 KINDS = {kind.__name__.replace("_", "-"): kind for kind in KINDS}
+_RUNNING: set[subprocess.Popen] = set()
 
 
 def run(job: Job) -> int:
@@ -402,7 +404,12 @@ def run(job: Job) -> int:
     at_once = min(job.jobs, len(job.lanes))
     prefixes = [f"{number} | " if at_once > 1 else "" for number in range(1, len(job.lanes) + 1)]
     with ThreadPoolExecutor(at_once) as pool:
-        statuses = list(pool.map(run_lane, job.lanes, prefixes))
+        try:
+            statuses = list(pool.map(run_lane, job.lanes, prefixes))
+        except KeyboardInterrupt:
+            for process in list(_RUNNING):
+                process.terminate()
+            raise
     return max([*statuses, *(_call(name, arguments) for name, *arguments in job.then)])
 
 
@@ -410,7 +417,7 @@ def _call(name: str, arguments: list[str], prefix: str = "") -> int:
     """Run a command, each line of its output behind ``prefix``; return its exit status.
 
     Raises:
-        KeyboardInterrupt: if the command was interrupted.
+        KeyboardInterrupt: if the command was interrupted, with the number of the signal.
     """
     if name == "train" and not any(word.startswith("run=") for word in arguments):
         arguments = ["--multirun", *arguments]
@@ -419,16 +426,29 @@ def _call(name: str, arguments: list[str], prefix: str = "") -> int:
     command = [str(Path(sys.executable).with_name(f"forewarp-{name}")), *arguments]
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT} if prefix else {}
     with subprocess.Popen(command, text=True, **pipes) as process:
+        _RUNNING.add(process)
         try:
             for line in process.stdout or ():
                 print(f"{prefix}{line}", end="", flush=True)
             process.wait()
-        except BaseException:  # leave no command behind
-            process.kill()
+        except BaseException:  # leave no command behind, and let it save
+            _end(process)
             raise
-    if process.returncode < 0 or process.returncode >= 128:
-        raise KeyboardInterrupt
+        finally:
+            _RUNNING.discard(process)
+    if process.returncode < 0 or process.returncode > INTERRUPTED:
+        raise KeyboardInterrupt(abs(process.returncode) % INTERRUPTED)
     return process.returncode
+
+
+def _end(process: subprocess.Popen) -> None:
+    """Ask a command to end, and wait for it; another interruption kills it."""
+    process.terminate()
+    try:
+        process.communicate()
+    except BaseException:
+        process.kill()
+        raise
 
 
 def main() -> None:
@@ -454,10 +474,10 @@ def main() -> None:
             sys.exit(MISTAKE)
         print(f"no estimate: {line}", flush=True)  # the sweep with the mistake ends with it
     try:
-        sys.exit(0 if plan_only else run(job))
-    except KeyboardInterrupt:
-        print("\nforewarp-reproduce: interrupted; run the same command again to go on", file=sys.stderr)
-        sys.exit(INTERRUPTED)
+        with listening():
+            sys.exit(0 if plan_only else run(job))
+    except KeyboardInterrupt as interruption:
+        sys.exit(interrupted("reproduce", interruption))
 
 
 if __name__ == "__main__":

@@ -22,8 +22,10 @@ from __future__ import annotations
 
 from importlib.util import find_spec
 from pathlib import Path
+from signal import SIGINT
 
 from forewarp.cli.entry import command
+from forewarp.interrupts import signal_of
 
 TOLERANCE = 1e-3  # by which two runs' test cameras may differ, of their distance to the origin
 
@@ -63,7 +65,9 @@ def view(config) -> None:
         print(f"see it: {address} (Ctrl-C ends)", flush=True)
         try:
             viewer.queue.run_forever()
-        except KeyboardInterrupt:
+        except KeyboardInterrupt as interruption:
+            if signal_of(interruption) != SIGINT:
+                raise
             print()
 
 

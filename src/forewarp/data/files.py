@@ -293,6 +293,19 @@ def fingerprint(folder: Path) -> dict:
     return {"texts": texts, "images": {"count": len(sizes), "bytes": sum(sizes), "sha256": digest}}
 
 
+def stamps(folder: Path) -> dict[str, tuple[int, int]]:
+    """Return size and time of the last change, in ns, of each of a scene's files by name.
+
+    Cost: about 5 microseconds a file.
+    """
+    found = {}
+    for path in _files(folder):
+        with suppress(FileNotFoundError):
+            about = path.stat()
+            found[path.relative_to(folder).as_posix()] = (about.st_size, about.st_mtime_ns)
+    return found
+
+
 def difference(before: dict, now: dict) -> str | None:
     """Say in a few words how two fingerprints differ; None if they are equal."""
     old, new = before.get("texts", {}), now["texts"]

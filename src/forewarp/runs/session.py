@@ -14,8 +14,8 @@ from filelock import FileLock, Timeout
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
-from forewarp.data.files import LOCK, difference, mismatch, one_of
-from forewarp.files import read_json, read_text, refuse_links, replace_file, write_json
+from forewarp.data.files import LOCK, difference, mismatch, one_of, stamps
+from forewarp.files import held, read_json, read_text, refuse_links, replace_file, write_json
 from forewarp.provenance import installed
 from forewarp.runs.config import (
     IDENTITY,
@@ -37,7 +37,8 @@ _TYPED = ("model.name", "data.scene", "data.root", "seed", "preset", "budget")
 
 @contextmanager
 def session(run: Run, config: DictConfig, *, finished: bool = False) -> Iterator[None]:
-    """Hold the folder of a run whose scene is read: lock it, claim it for ``config``, check its data.
+    """Hold the folder of a run whose scene is read: lock it, claim it for ``config``, check its data; at the
+    end warn on stderr of files of the scene that have changed meanwhile.
 
     Args:
         run: the run that ``config`` describes.
@@ -45,15 +46,19 @@ def session(run: Run, config: DictConfig, *, finished: bool = False) -> Iterator
         finished: if true, the stored config stays as it is; see ``claim``.
 
     Raises:
-        ValueError: if another process works on the folder, it holds another run, or its data have changed.
+        ValueError: if another process works on the folder, it holds another run, or its data have changed;
+            at the end, if the folder was deleted or moved meanwhile.
         OSError: if the folder cannot be written.
     """
-    with locked(run.folder):
+    with locked(run.folder), held(run.folder) as check_folder:
         claim(config, finished=finished)
         check_data(run, config.get("data_changed", "refuse"))
+        before = _stamps_of(run)
         if not finished:
             replace_file(run.folder / PACKAGES, installed())
         yield
+        check_folder()
+        _warn_of_exchanged(run, before)
 
 
 @contextmanager
@@ -180,6 +185,20 @@ def warn_if_changed(run: Run) -> None:
     """Warn on stderr if the scene's files differ from those in ``data.json``."""
     if differs := _compared(run)[-1]:
         print(f"warning: {differs}", file=sys.stderr)
+
+
+def _stamps_of(run: Run) -> dict[str, tuple[int, int]]:
+    return {} if run.datamodule.place is None else stamps(run.datamodule.place)
+
+
+def _warn_of_exchanged(run: Run, before: dict[str, tuple[int, int]]) -> None:
+    """Warn on stderr of files of the scene that are not as they were ``before``."""
+    now = _stamps_of(run)
+    if changed := sorted(name for name in before | now if before.get(name) != now.get(name)):
+        got = ", ".join(changed[:3]) + (f" and {len(changed) - 3} more" if len(changed) > 3 else "")
+        expected = f"{run.datamodule.place}: expected files that stay as they are while a run works on them"
+        advice = "what was trained and measured may mix both: run it again with run=<another folder>"
+        print(f"warning: {expected}, but got others: {got}; {advice}", file=sys.stderr)
 
 
 def _compared(run: Run) -> tuple[Path, dict | None, dict | None, str | None]:

@@ -11,7 +11,6 @@ import io
 import math
 import signal
 import sys
-import threading
 import zipfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -21,6 +20,7 @@ import lightning
 import torch
 
 from forewarp.files import read_json, replace_file, write_json, written_whole
+from forewarp.interrupts import answer, interrupt, listening
 from forewarp.methods.method import HasBounds, HasMatter, HasTrajectories, Method
 from forewarp.scene.box import Box
 from forewarp.scene.cloud import Cloud, Handover
@@ -29,7 +29,8 @@ from forewarp.training.module import DynamicSceneModule
 
 
 class KeepCheckpoint(lightning.Callback):
-    """Save a checkpoint at regular intervals of training time, and after the step that Ctrl-C interrupts.
+    """Save a checkpoint at regular intervals of training time, and after the step that Ctrl-C or a request to
+    end interrupts.
 
     Args:
         path: file of the checkpoint, replaced each time.
@@ -37,25 +38,27 @@ class KeepCheckpoint(lightning.Callback):
         check: called before saving; raises if the state is broken, so that the last checkpoint stays.
 
     Attributes:
-        asked: whether Ctrl-C was pressed inside ``listening()``.
+        asked: the signal that came inside ``listening()``; 0: none.
     """
 
     def __init__(self, path: Path, seconds: float, check: Callable[[lightning.Trainer], None]) -> None:
         self.path, self.every, self.check = Path(path), seconds, check
-        self.asked = False
+        self.asked, self._signals = 0, []
 
     def on_train_start(self, trainer, module) -> None:
         """Count from where a continued run stands."""
         self._next = module.clock.seconds + self.every
+        if not self.asked:
+            answer(self._signals, self._ask)  # at SIGTERM Lightning would end unsaved, with status 0
 
     def on_train_batch_end(self, trainer, module, outputs, batch, batch_idx) -> None:
-        """Save if it is time or if Ctrl-C was pressed; then stop if it was."""
+        """Save if it is time or if asked to end; then end if so."""
         if self.asked or module.clock.seconds >= self._next:
             self._next = module.clock.seconds + self.every
             with module.clock.paused():
                 self.save(trainer)
         if self.asked:
-            raise KeyboardInterrupt
+            raise KeyboardInterrupt(self.asked)
 
     def save(self, trainer: lightning.Trainer) -> None:
         """Save now."""
@@ -65,28 +68,19 @@ class KeepCheckpoint(lightning.Callback):
 
     @contextmanager
     def listening(self) -> Iterator[None]:
-        """Let the first Ctrl-C only ask to save this step and stop; a second one stops the process at once.
-
-        Do nothing if the program handles or ignores Ctrl-C itself, or in a thread other than the main one,
-        which receives no signals.
+        """Let the first Ctrl-C, SIGTERM or SIGHUP only ask to save this step and stop; a second one of its
+        kind stops the process at once. See ``interrupts.listening``.
         """
-
-        def ask(number, frame) -> None:
-            signal.signal(signal.SIGINT, signal.default_int_handler)
-            self.asked = True
-            with suppress(OSError, RuntimeError):  # it may interrupt another print
-                says = "\nends this step and saves it; Ctrl-C again stops at once"
-                print(says, file=sys.stderr, flush=True)
-
-        in_main = threading.current_thread() is threading.main_thread()
-        ours = in_main and signal.getsignal(signal.SIGINT) is signal.default_int_handler
-        if ours:
-            signal.signal(signal.SIGINT, ask)
-        try:
+        with listening(self._ask) as self._signals:
             yield
-        finally:
-            if ours:  # Lightning may have replaced it
-                signal.signal(signal.SIGINT, signal.default_int_handler)
+
+    def _ask(self, number: int, frame: object) -> None:
+        self.asked = number
+        answer([number], interrupt)
+        with suppress(OSError, RuntimeError):  # it may interrupt another print
+            name = "Ctrl-C" if number == signal.SIGINT else signal.Signals(number).name
+            says = f"ends this step and saves it; {name} again stops at once"
+            print(f"\n{says}", file=sys.stderr, flush=True)
 
 
 def load_weights(module: DynamicSceneModule, path: Path) -> None:

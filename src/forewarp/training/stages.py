@@ -6,6 +6,7 @@ import ctypes
 import gc
 import re
 import resource
+import signal
 import sys
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -16,7 +17,7 @@ import lightning
 import torch
 
 from forewarp.clock import Clock
-from forewarp.files import read_json, write_json
+from forewarp.files import held, read_json, write_json
 from forewarp.methods.method import Model, Start, parameter_count
 from forewarp.provenance import source_of, versions
 from forewarp.scene.cloud import Handover
@@ -130,7 +131,8 @@ class Run:
                 checkpoints.load_weights(module, folder / "last.ckpt")
                 self.tell(f"{stage.settings.name}: finished before")
             else:
-                self._fit_stage(stage, module, handover, steps)
+                with held(folder) as check_folder:
+                    self._fit_stage(stage, module, handover, steps, check_folder)
             steps += int(_done(folder)["steps"])
             handover = checkpoints.load_handover(folder)
         return module
@@ -223,13 +225,23 @@ class Run:
         )
 
     def _fit_stage(
-        self, stage: Stage, module: DynamicSceneModule, before: Handover | None, steps_before: int
+        self,
+        stage: Stage,
+        module: DynamicSceneModule,
+        before: Handover | None,
+        steps_before: int,
+        check_folder: Callable[[], None],
     ) -> None:
         """Train a stage to its end, from its checkpoint if it has one, and write what it leaves."""
+
+        def check(trainer: lightning.Trainer) -> None:
+            check_folder()
+            sentinel.check(trainer)
+
         settings, folder = stage.settings, self.stage_folder(stage)
         last = folder / "last.ckpt"
         sentinel = Sentinel(folder, skip=self.skip)
-        keeper = checkpoints.KeepCheckpoint(last, self.checkpoint_seconds, sentinel.check)
+        keeper = checkpoints.KeepCheckpoint(last, self.checkpoint_seconds, check)
         checkpoint, steps = last if last.is_file() else None, 0
         if checkpoint is not None:
             steps, seconds = checkpoints.check_state(checkpoint, module)
@@ -243,7 +255,7 @@ class Run:
         with keeper.listening():
             trainer.fit(module, datamodule=self.datamodule, ckpt_path=checkpoint, weights_only=True)
         if module.fraction < 1:  # fit returned early, as when a callback stops it: the stage is not finished
-            raise KeyboardInterrupt
+            raise KeyboardInterrupt(keeper.asked or signal.SIGINT)
         curriculum, most = module.curriculum, module.settings.iterations
         in_play, count = curriculum.in_play, len(curriculum.order)
         name = settings.name
@@ -263,8 +275,8 @@ class Run:
         done |= {"frames_in_play": in_play, "peak_memory_bytes": peak_memory_bytes(), **target}
         done |= {"skipped_steps": sentinel.skipped, "code": code, "versions": versions()}
         write_json(folder / "done.json", done)
-        if keeper.asked:  # pressed after the stage's last step
-            raise KeyboardInterrupt
+        if keeper.asked:  # after the stage's last step
+            raise KeyboardInterrupt(keeper.asked)
 
     def _target_of(self, stage: Stage, module: DynamicSceneModule) -> dict:
         """Say whether the target was reached, and when; return it for the last stage's ``done.json``."""
