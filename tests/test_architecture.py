@@ -7,10 +7,10 @@ from pathlib import Path
 import pytest
 
 SOURCE = Path(__file__).parents[1] / "src" / "forewarp"
-BOTTOM = {"clock", "files", "interrupts", "progress", "provenance"}  # open to all
+BOTTOM = {"archives", "clock", "files", "interrupts", "media", "progress", "provenance"}  # open to all
 LOWER = {"ops", "scene", "losses", "metrics", "fields", "drawing", "renderer"}
 MAY_IMPORT = {
-    **dict.fromkeys(["clock", "files", "interrupts", "progress", "provenance", "ops"], set()),
+    **dict.fromkeys([*BOTTOM, "ops"], set()),
     "scene": {"ops"},
     "losses": {"ops"},
     **dict.fromkeys(["metrics", "drawing", "fields", "data"], {"ops", "scene"}),
@@ -45,11 +45,16 @@ CONFIG = {"runs", "planning", "cli"}
 ONLY_IN = {
     **dict.fromkeys(["hydra", "omegaconf"], CONFIG),
     "lightning": {"data", "training", "evaluation", "runs", "planning", "viewer", "cli"},
-    **{"torchmetrics": {"metrics"}, "numba": {"ops"}, "PIL": {"data", "report"}, "matplotlib": {"report"}},
+    **{
+        "torchmetrics": {"metrics"},
+        "numba": {"ops"},
+        "PIL": {"media", "data", "report"},
+        "matplotlib": {"report"},
+    },
     **{"trimesh": {"synth"}, "embreex": {"synth"}, "torchvision": set()},
     **{"pycolmap": {"capture"}, "cv2": {"capture"}, "lzfse": {"capture"}},
     **{"skimage": {"export"}, "viser": {"export", "viewer", "cli"}},
-    **{"imageio": {"drawing", "evaluation", "cli"}, "imageio_ffmpeg": {"drawing", "data", "cli"}},
+    **{"imageio": {"drawing", "evaluation", "cli"}, "imageio_ffmpeg": {"media", "drawing"}},
     "rich": {"progress", "training", "evaluation", "planning", "cli"},
 }
 CONTRACT = {

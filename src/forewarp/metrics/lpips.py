@@ -8,7 +8,6 @@ linear heads come with torchmetrics. (torchmetrics' own LPIPS needs torchvision.
 from __future__ import annotations
 
 import os
-import pickle
 from collections.abc import Iterable, Iterator
 from importlib import resources
 from pathlib import Path
@@ -17,6 +16,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from forewarp.archives import read_archive
 from forewarp.metrics.image import image_pair
 from forewarp.metrics.registry import LPIPS_LEAST_SIDE, NETS
 
@@ -195,11 +195,11 @@ def _load_backbone(features: nn.Sequential, file: Path, net: str) -> None:
     """Load a state dict; unpickle tensors only."""
     what = f"weights of {net}'s features"
     try:
-        stored = torch.load(file, map_location="cpu", weights_only=True)
-    except (OSError, RuntimeError, EOFError, pickle.UnpicklingError) as error:
-        raise ValueError(f"{file}: expected {what}, but got {type(error).__name__} on reading") from error
-    if not isinstance(stored, dict) or not all(isinstance(value, Tensor) for value in stored.values()):
-        raise ValueError(f"{file}: expected {what}, but got a {type(stored).__name__} of other things")
+        stored = read_archive(file, legacy=True)
+    except (OSError, ValueError) as error:
+        raise ValueError(f"{file}: expected {what}, but got {error} on reading") from error
+    if not all(isinstance(value, Tensor) for value in stored.values()):
+        raise ValueError(f"{file}: expected {what}, but got other things")
     state = {str(key).removeprefix("features."): value for key, value in stored.items()}
     try:
         features.load_state_dict({key: state[key] for key in features.state_dict() if key in state})

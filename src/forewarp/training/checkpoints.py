@@ -7,11 +7,9 @@ moves the file from the temporary folder, perhaps another disk, without syncing 
 
 from __future__ import annotations
 
-import io
 import math
 import signal
 import sys
-import zipfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -19,7 +17,8 @@ from pathlib import Path
 import lightning
 import torch
 
-from forewarp.files import read_json, replace_file, write_json, written_whole
+from forewarp.archives import read_archive, write_archive
+from forewarp.files import read_json, write_json, written_whole
 from forewarp.interrupts import answer, interrupt, listening
 from forewarp.methods.method import HasBounds, HasMatter, HasTrajectories, Method
 from forewarp.scene.box import Box
@@ -144,59 +143,6 @@ def misfits(module: DynamicSceneModule, weights: dict) -> list[str]:
         name = module.method.misfit({str(k).removeprefix("method."): v for k, v in weights.items()})
         differ = [] if name is None else [f"method.{name}"]
     return differ
-
-
-def write_archive(path: Path, content: dict) -> None:
-    """Write tensors and plain values as a whole file.
-
-    Raises:
-        OSError: naming the file, if it cannot be written; nothing is then left beside it.
-    """
-    packed = io.BytesIO()
-    torch.save(content, packed)  # into a file it would hide why the system refused
-    replace_file(path, packed.getbuffer())
-
-
-def read_archive(path: Path) -> dict:
-    """Read a dict that ``torch.save`` wrote; execute nothing, and allow no tensor larger than the file.
-
-    Raises:
-        OSError: if the file cannot be opened.
-        ValueError: with the kind of the fault, if it is no such file, damaged, or compressed.
-
-    Cost: reads the file twice, as torch does not verify the checksums.
-    """
-    try:
-        with zipfile.ZipFile(path) as archive:
-            members = archive.infolist()
-            # A stored member is no longer than the file; a compressed one may be, a thousand times.
-            packed = any(member.compress_type != zipfile.ZIP_STORED for member in members)
-            larger = sum(member.file_size for member in members) > path.stat().st_size
-            if packed or larger or archive.testzip() is not None:
-                raise zipfile.BadZipFile
-        content = torch.load(path, map_location="cpu", weights_only=True)
-        if not isinstance(content, dict):
-            raise TypeError
-        _check_stored(content)
-        return content
-    except OSError:
-        raise
-    except Exception as error:  # unpickling alone raises half a dozen kinds
-        raise ValueError(type(error).__name__) from None
-
-
-def _check_stored(content: dict) -> None:
-    """Refuse tensors of which the file does not store every entry: a copy would be larger than the file."""
-    left, seen = [content], set()
-    while left:
-        node = left.pop()
-        if torch.is_tensor(node):
-            plain = node.layout == torch.strided and node.device.type == "cpu"
-            if not plain or node.numel() * node.element_size() > node.untyped_storage().nbytes():
-                raise TypeError
-        elif isinstance(node, dict | list | tuple | set) and id(node) not in seen:
-            seen.add(id(node))  # a container may hold itself
-            left += [*node, *node.values()] if isinstance(node, dict) else node
 
 
 NUMBERS, POINTS = "handover.json", "handover.pt"

@@ -23,7 +23,7 @@ from tensorboard.compat.proto.summary_pb2 import Summary
 from torch import Tensor
 
 from forewarp.drawing.images import image_size, to_bytes
-from forewarp.files import MOST_CONFIG, read_json, read_text, write_json
+from forewarp.files import load_yaml, read_json, write_json
 
 IDS = "loggers.json"  # in the run's folder: which run of its tracker each logger goes on with
 _PACKAGES = {WandbLogger: "wandb", MLFlowLogger: "mlflow"}
@@ -285,7 +285,7 @@ def _last_part(path: re.Match) -> str:
 
 
 def _log_config(logger: Logger, file: Path, step: int) -> None:
-    content = redacted(yaml.safe_load(read_text(file, MOST_CONFIG)))
+    content = redacted(load_yaml(file))
     _log_text(logger, "config", yaml.safe_dump(content, sort_keys=False, allow_unicode=True), step)
 
 

@@ -12,9 +12,9 @@ import torch
 from torch import Tensor
 from torch.nn.utils import get_total_norm
 
+from forewarp.archives import write_archive
 from forewarp.methods.method import check_least
 from forewarp.scene.view import Batch
-from forewarp.training.checkpoints import write_archive
 from forewarp.training.module import DynamicSceneModule
 from forewarp.training.objective import parts
 
