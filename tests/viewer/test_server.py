@@ -2,6 +2,7 @@
 
 import contextlib
 import errno
+import html
 import math
 import os
 import socket
@@ -23,7 +24,7 @@ import viser
 
 from forewarp.scene.cloud import Ellipsoids
 from forewarp.viewer import server as server_module
-from forewarp.viewer.page import Page, fitted_fov, splat_arrays
+from forewarp.viewer.page import Page, fitted_fov, markdown_text, splat_arrays
 from forewarp.viewer.queue import Cancelled
 from forewarp.viewer.rendering import SceneRenderer, Viewer, ViewState, first_frame, vertical_fov
 from forewarp.viewer.server import check_address
@@ -97,7 +98,7 @@ def test_an_address_on_which_nothing_can_listen_is_refused(monkeypatch, where, s
 
 
 def test_pages_of_foreign_sites_are_sent_nothing(viewer, tmp_path):
-    from websockets.exceptions import ConnectionClosed
+    from websockets.exceptions import InvalidStatus
     from websockets.sync.client import connect
 
     with serving(viewer, tmp_path) as address:
@@ -110,12 +111,54 @@ def test_pages_of_foreign_sites_are_sent_nothing(viewer, tmp_path):
         ):
             asked = {"origin": origin, "subprotocols": [f"viser-v{viser.__version__}"], "proxy": None}
             sock = socket.create_connection(there.split(":"), timeout=10)
-            with connect(f"ws://{host}", sock=sock, **asked) as client:
-                if welcome:
+            if welcome:
+                with connect(f"ws://{host}", sock=sock, **asked) as client:
                     assert len(client.recv(timeout=10)) > 100
-                else:
-                    with pytest.raises(ConnectionClosed, match="not a page of this server"):
-                        client.recv(timeout=10)
+            else:
+                with (
+                    pytest.raises(InvalidStatus, match="HTTP 403"),
+                    connect(f"ws://{host}", sock=sock, **asked),
+                ):
+                    pass
+
+
+@pytest.mark.parametrize(
+    ("host", "requested", "welcome"),
+    [
+        ("0.0.0.0", "192.0.2.7:8080", True),
+        ("0.0.0.0", "[::1]:8080", True),
+        ("0.0.0.0", f"{socket.gethostname()}:8080".lower(), True),
+        ("render.example", "render.example:8080", True),
+        ("0.0.0.0", "evil.example:8080", False),  # whose name leads here since
+        ("::", "evil.example", False),
+        ("0.0.0.0", "[", False),
+        ("0.0.0.0", None, False),
+    ],
+)
+def test_a_foreign_name_that_leads_here_is_no_page_of_ours(host, requested, welcome):
+    assert server_module.is_same_origin(host, requested, None) is welcome
+    assert server_module.is_same_origin(host, requested, f"http://{requested}") is welcome
+
+
+def test_the_page_runs_no_script_but_its_own_and_lies_in_no_frame(viewer, tmp_path):
+    with serving(viewer, tmp_path) as address, urllib.request.urlopen(address, timeout=10) as page:
+        policy, text = page.headers["Content-Security-Policy"], page.read().decode()
+        assert page.headers["X-Frame-Options"] == "DENY"
+        assert int(page.headers["Content-Length"]) == len(text.encode())
+    rules = dict(rule.split(" ", 1) for rule in policy.split("; "))
+    assert rules["frame-ancestors"] == rules["object-src"] == rules["frame-src"] == "'none'"
+    assert "unsafe-inline" not in rules["script-src"]
+    nonce = rules["script-src"].split()[0].removeprefix("'nonce-").rstrip("'")
+    assert text.count(f'nonce="{nonce}"') == 1  # the script that its own makes
+    assert f"<script nonce={nonce} " in text
+
+
+def test_text_on_the_page_is_no_markup(viewer):
+    page = object.__new__(Page)
+    page.status = Mock()
+    page.tell("training image <iframe srcdoc='<script>1</script>'>*b*.png: [x](javascript:1)")
+    assert not set("<>*[]()'`") & set(page.status.content)
+    assert html.unescape(page.status.content).startswith("training image <iframe srcdoc='<script>")
 
 
 @pytest.mark.parametrize(("side", "away"), [(1, 2.0), (-1, 7.0)])
@@ -381,7 +424,7 @@ def test_a_video_that_cannot_be_sent_is_written_all_the_same(tmp_path, broken, s
     make = buttons["make the video"]
     with pytest.raises(RuntimeError) if broken == "download" else contextlib.nullcontext():
         make.on_click.call_args.args[0](None)
-    assert page.client.gui.add_markdown.return_value.content == says.format(file)
+    assert page.client.gui.add_markdown.return_value.content == markdown_text(says.format(file))
     assert make.disabled is False
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -52,7 +53,7 @@ class Page:
         self.status = client.gui.add_markdown("...")
         if len(viewer.renderers) == 2:
             left, right = (renderer.name for renderer in viewer.renderers)
-            client.gui.add_markdown(f"left: **{left}**, right: **{right}**")
+            client.gui.add_markdown(f"left: **{markdown_text(left)}**, right: **{markdown_text(right)}**")
         self._add_time()
         self._add_channels()
         self._add_training_images()
@@ -108,7 +109,7 @@ class Page:
 
     def tell(self, text: str) -> None:
         """Say how fast images come, or what is going on."""
-        self.status.content = text
+        self.status.content = markdown_text(text)
 
     def show_time(self, time: float) -> None:
         """Move the slider to the time."""
@@ -276,7 +277,7 @@ class Page:
             make = gui.add_button("make the video")
 
         def tell(text: str) -> None:
-            status.content = text
+            status.content = markdown_text(text)
 
         def set_keys(*states: ViewState) -> None:
             keys[:] = states
@@ -333,6 +334,15 @@ def splat_arrays(cloud: Ellipsoids, unit: float) -> list[np.ndarray]:
     """
     parts = cloud.centers / unit, cloud.covariances / unit**2, cloud.colors, cloud.opacity[:, None]
     return [part.cpu().numpy() for part in parts]
+
+
+def markdown_text(text: str) -> str:
+    """Write text so that Markdown, in which viser takes HTML too, shows it as it is, in one line.
+
+    >>> markdown_text("a_1.png <b>")
+    'a&#95;1&#46;png &#60;b&#62;'
+    """
+    return re.sub(r"[^\w\s]|_", lambda sign: f"&#{ord(sign[0])};", " ".join(text.split()))
 
 
 @contextmanager

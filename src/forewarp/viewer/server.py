@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import gzip
 import io
 import ipaddress
+import secrets
 import socket
 import time
 import traceback
@@ -17,6 +19,7 @@ from urllib.parse import urlsplit
 import lightning
 import torch
 import viser
+import websockets.asyncio.server
 
 from forewarp.training.stages import Run
 from forewarp.viewer.page import Page
@@ -24,6 +27,24 @@ from forewarp.viewer.rendering import SceneRenderer, Viewer, ViewState, turning_
 
 _REFRESH_SECONDS = 2.0  # between two images of a page at rest, of a run in training
 _RENEWAL_SECONDS = 20.0  # after which points of trajectories are chosen anew
+# What the page may do: its own scripts, which bear a number, and nothing of another site. They make functions
+# of texts themselves, where splats are sorted.
+_POLICY = (
+    "default-src 'self'; script-src 'nonce-{nonce}' 'unsafe-eval' 'wasm-unsafe-eval' blob:; "
+    "worker-src 'self' blob: data:; "
+    "style-src 'self' 'unsafe-inline'; img-src 'self' data: blob:; font-src 'self' data:; "
+    "media-src 'self' data: blob:; connect-src 'self' ws://{host} wss://{host} data: blob:; "
+    "object-src 'none'; frame-src 'none'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+)
+_HEADERS = {"X-Frame-Options": "DENY", "X-Content-Type-Options": "nosniff", "Referrer-Policy": "no-referrer"}
+# Where scripts begin in viser's page: its own, and the one that this makes.
+_SCRIPTS = (
+    ("<script ", "<script nonce={nonce} "),
+    (
+        'createElement("script");',
+        'createElement("script");e.nonce="{nonce}";',
+    ),
+)
 
 
 class _Server(viser.ViserServer):
@@ -91,21 +112,50 @@ def _listen(host: str, port: int) -> _Server:
     check_address(host, port)
     # What a page is sent in the moment in which it leaves is lost, as it should be.
     warnings.filterwarnings("ignore", message="Queued a .* on a closed connection", category=UserWarning)
-    with contextlib.redirect_stdout(io.StringIO()):
+    with contextlib.redirect_stdout(io.StringIO()), _guarded(host):
         server = _Server(host=host, port=port, verbose=False)
         if port and server.get_port() != port:  # viser takes the next free one and says nothing
             server.stop()
             raise ValueError(port_in_use(port))
-    sockets = server._websock_server  # viser has no public way to a request's headers, and asks nobody
-
-    @sockets.on_client_connect
-    async def _(client) -> None:
-        connection = sockets._live_connections[client.client_id]
-        headers = connection.request.headers
-        if not is_same_origin(host, headers.get("Host"), headers.get("Origin")):
-            await connection.close(1008, "not a page of this server")
-
     return server
+
+
+@contextlib.contextmanager
+def _guarded(host: str) -> Iterator[None]:
+    """Let a server that begins within answer pages of its own alone, which run no script but theirs.
+
+    viser looks at no request and has no place for headers; so what it calls of websockets is wrapped.
+    """
+    begin, nonce = websockets.asyncio.server.serve, secrets.token_urlsafe(16)
+
+    def serve(handler: Callable, *given, process_request: Callable, **options):
+        def answer(connection, request):
+            headers = request.headers
+            if not is_same_origin(host, headers.get("Host"), headers.get("Origin")):
+                return connection.respond(403, "not a page of this server: open it by its address\n")
+            return process_request(connection, request)
+
+        def finish(connection, request, response) -> None:
+            policy = _POLICY.format(nonce=nonce, host=request.headers.get("Host", ""))
+            for name, value in {**_HEADERS, "Content-Security-Policy": policy}.items():
+                response.headers[name] = value
+            if response.headers.get("Content-Type", "").startswith("text/html"):
+                is_packed = response.headers.get("Content-Encoding") == "gzip"
+                text = gzip.decompress(response.body) if is_packed else response.body
+                for place, marked in _SCRIPTS:
+                    text = text.replace(place.encode(), marked.format(nonce=nonce).encode(), 1)
+                response.body = text
+                for name, value in {"Content-Encoding": "identity", "Content-Length": str(len(text))}.items():
+                    del response.headers[name]  # else a second one is added
+                    response.headers[name] = value
+
+        return begin(handler, *given, process_request=answer, process_response=finish, **options)
+
+    websockets.asyncio.server.serve = serve
+    try:
+        yield
+    finally:
+        websockets.asyncio.server.serve = begin
 
 
 class LiveView(lightning.Callback):
@@ -230,8 +280,8 @@ def is_same_origin(host: str, requested: str | None, origin: str | None) -> bool
 
     Args:
         host: where the server listens.
-        requested: the request's ``Host``. Where the server listens for this machine alone it must name this
-            machine: a foreign site may let its own name point here.
+        requested: the request's ``Host``, which must be an address, or name this machine: a foreign site
+            may let its own name point here.
         origin: the request's ``Origin``; None: no browser.
 
     >>> is_same_origin("127.0.0.1", "localhost:9000", "http://localhost:9000")
@@ -240,11 +290,27 @@ def is_same_origin(host: str, requested: str | None, origin: str | None) -> bool
     False
     >>> is_same_origin("127.0.0.1", "evil.example:8080", "http://evil.example:8080")
     False
+    >>> is_same_origin("0.0.0.0", "evil.example:8080", "http://evil.example:8080")
+    False
+    >>> is_same_origin("0.0.0.0", "192.0.2.7:8080", "http://192.0.2.7:8080")
+    True
     """
     requested = (requested or "").lower()
-    if origin is not None and urlsplit(origin.lower()).netloc != requested:
+    try:
+        name = urlsplit(f"//{requested}").hostname or ""
+        if origin is not None and urlsplit(origin.lower()).netloc != requested:
+            return False
+    except ValueError:  # half a pair of brackets
         return False
-    return not _is_loopback(host) or _is_loopback(urlsplit(f"//{requested}").hostname or "")
+    return _is_loopback(name) if _is_loopback(host) else _is_own(name, host)
+
+
+def _is_own(name: str, host: str) -> bool:
+    """Tell whether a name is an address, or one of this machine's."""
+    with contextlib.suppress(ValueError):
+        return ipaddress.ip_address(name) is not None
+    machine = socket.gethostname().lower()
+    return name in ("localhost", host.lower(), machine, f"{machine}.local")
 
 
 def _is_loopback(host: str) -> bool:
