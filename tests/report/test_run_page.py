@@ -1,6 +1,7 @@
 """The page of a run that nobody trained, and of a fitted one."""
 
 import json
+import os
 import re
 import shutil
 from html.parser import HTMLParser
@@ -110,6 +111,40 @@ def test_the_page_tells_what_the_run_is(tmp_path, monkeypatch):
     assert page.of("href") == []
     assert all(alt is not None for alt in page.of("alt"))
     assert page.tags.count("img") == len(page.of("alt")) == 5
+
+
+def as_link(path):
+    path.symlink_to("/etc/passwd")
+
+
+BAD = {  # what lies in a run's folder -> how it is made, and what the refusal says
+    "videos/both.mp4": (as_link, "both.mp4: expected no links inside a run's folder"),
+    "images/sheets/a.png": (as_link, "a.png: expected no links inside a run's folder"),
+    "metrics.json": (as_link, "metrics.json: expected no links inside a run's folder"),
+    "tensorboard/events.out.tfevents.1": (os.mkfifo, "expected a file, but got a device or a pipe"),
+    "plan.yaml": (lambda path: path.write_text("a: &a [1]\nb: [*a, *a]"), "expected no aliases"),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_what_lies_in_the_folder_of_a_stranger_is_refused_before_it_is_read(tmp_path, name):
+    (folder := told_run(tmp_path, views=0)).joinpath(name).parent.mkdir(parents=True, exist_ok=True)
+    (folder / name).unlink(missing_ok=True)
+    make, said = BAD[name]
+    make(folder / name)
+    with pytest.raises(ValueError, match=said):
+        read_story(folder)
+
+
+def test_names_of_stages_lead_nowhere(tmp_path):
+    with pytest.raises(ValueError, match="stage: expected names of letters, digits, _ and -, but got '../x'"):
+        read_story(told_run(tmp_path, config={"stage": {"../x": {"share": 1.0}}}))
+
+
+def test_a_file_that_is_no_video_is_not_put_into_the_page(tmp_path):
+    (video := tmp_path / "both.mp4").write_text("0000ftyp the user's own")
+    with pytest.raises(ValueError, match="both.mp4: expected an MP4 video, but got another file"):
+        write(told_run(tmp_path), Media([shown()], video=video))
 
 
 def test_what_a_file_says_is_text_and_never_markup(tmp_path):

@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import mmap
 import os
-import warnings
 import weakref
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
@@ -21,13 +20,12 @@ from torch import Tensor
 from forewarp.clock import left_out
 from forewarp.data.files import mismatch, number, one_of, opened, read_bytes
 from forewarp.files import MOST_IMAGE, written_whole
+from forewarp.media import MOST_PIXELS, TooManyPixels, open_image
 from forewarp.ops.grid import block_means, block_sums
 from forewarp.scene.frame import spread
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")
 TURN = "width and height are exchanged: turn its pixels by 90 degrees"
-_FORMATS = ("PNG", "JPEG")
-_MOST_PIXELS = 80_000_000  # Pillow warns a little above
 _OTHER_KINDS = {  # at which byte, which marks tell them
     "WebP": (8, b"WEBP"),
     "TIFF": (0, (b"II*\0", b"MM\0*", b"II+\0")),
@@ -437,29 +435,22 @@ def _decode(path: Path, mode: str, upright: bool = False) -> np.ndarray:
     try:
         # In one expression: while a name keeps the image alive, its memory is not used again.
         turn = ImageOps.exif_transpose if upright else (lambda image: image)
-        return np.array(turn(Image.open(content, formats=_FORMATS)).convert(mode))
+        return np.array(turn(open_image(content)).convert(mode))
     except Exception as error:  # decoders raise OSError, SyntaxError, struct.error and more
         raise mismatch(path, "an image", f"data that cannot be decoded ({error})") from error
 
 
 def _inspect(stream: BinaryIO, path: Path, mode: str = "RGBA") -> Header:
     """Check an open image, which is to be read in one of Pillow's modes."""
-    few_pixels = f"an image of 1 to {_MOST_PIXELS} pixels"
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("error", Image.DecompressionBombWarning)
-            image = Image.open(stream, formats=_FORMATS)
-        if not image.tile:
-            raise UnidentifiedImageError
-    except (Image.DecompressionBombWarning, Image.DecompressionBombError) as error:
-        raise mismatch(path, few_pixels, "more") from error
+        image = open_image(stream)
+    except TooManyPixels as error:
+        raise mismatch(path, f"an image of 1 to {MOST_PIXELS} pixels", error) from error
     except Exception as error:  # OSError, ValueError and more
         got, advice = str(error), ""
         if isinstance(error, UnidentifiedImageError):
             got, advice = _kind_of(stream)
         raise mismatch(path, "a PNG or JPEG image", got, advice) from error
-    if not 0 < image.width * image.height <= _MOST_PIXELS:
-        raise mismatch(path, few_pixels, by(image.size))
     has_16_bits = ";16" in str(image.tile[0][3])  # the mode alone hides it
     if mode == "I;16" and not (has_16_bits and image.mode.startswith("I")):
         raise mismatch(path, "a grey PNG of 16 bits a pixel", f"mode {image.mode}")

@@ -12,8 +12,10 @@ from itertools import islice
 from pathlib import Path
 from threading import Thread
 
-import imageio_ffmpeg
 import numpy as np
+
+from forewarp.data.files import mismatch
+from forewarp.media import MOST_PIXELS, ffmpeg_reading
 
 VIDEOS = (".mp4", ".mov", ".mkv", ".avi", ".webm")  # suffixes of a rig's films, in small letters
 _STAMP = re.compile(r"Parsed_showinfo.* n: *\d+ .* pts_time:(\S+)")
@@ -27,6 +29,8 @@ _UNSAID = re.compile(
 # The tags of a stream, and its size; a matrix of colours stands first in its tag.
 _TAGS = re.compile(r"Video: [^,]*, \w+(?:\(([^)]*)\))?, (\d+)x(\d+)")
 _MATRIX = re.compile(r"\b(?<!/)(bt|smpte|fcc|gbr|ycg|ictcp)")
+_SIDES = re.compile(r"Video: .*[ ,]\d+x\d+[ ,\n]")
+_TOO_LARGE = re.compile(r"Picture size (\d+x\d+) is invalid")
 _INTERLACED = re.compile(r"Video: .*\b(top|bottom) (coded )?first\b")
 _MOST_TOLD = 2000  # frames that ffmpeg is told to choose; a system takes 128 KiB in a word of a command
 _SD = 1024, 576  # pixels of the longer and the shorter side, at most
@@ -110,18 +114,22 @@ def _is_untagged_hd(video: Path) -> bool:
 
 
 def header_of(video: Path) -> str:
-    """Return what ffmpeg says of a video; kept until the file changes."""
-    try:
-        about = video.stat()
-    except OSError:  # ffmpeg says so
-        return _header(video, 0, 0)
+    """Return what ffmpeg says of a video; kept until the file changes.
+
+    Raises:
+        OSError: where there is none.
+        ValueError: for a pipe or a device, and for frames of more than ``MOST_PIXELS``.
+    """
+    about = video.stat()
     return _header(video, about.st_size, about.st_mtime_ns)
 
 
 @lru_cache(64)
 def _header(video: Path, size: int, changed: int) -> str:
-    call = [imageio_ffmpeg.get_ffmpeg_exe(), "-hide_banner", "-nostdin", "-i", str(video)]
-    return subprocess.run(call, capture_output=True).stderr.decode(errors="replace")
+    told = subprocess.run(ffmpeg_reading(video), capture_output=True).stderr.decode(errors="replace")
+    if (large := _TOO_LARGE.search(told)) and not _SIDES.search(told):  # else its frames have another size
+        raise mismatch(video, f"frames of at most {MOST_PIXELS} pixels", large[1])
+    return told
 
 
 def stamps_of(video: Path) -> np.ndarray:
@@ -129,8 +137,8 @@ def stamps_of(video: Path) -> np.ndarray:
 
     Those before 0 were cut off without coding the rest anew, as phones do, and are not shown.
     """
-    call = [imageio_ffmpeg.get_ffmpeg_exe(), "-nostdin", "-v", "quiet", "-i", str(video), "-map", "0:v:0"]
-    done = subprocess.run([*call, "-c", "copy", "-f", "framecrc", "-"], capture_output=True)
+    call = [*ffmpeg_reading(video, "-v", "quiet"), "-map", "0:v:0", "-c", "copy", "-f", "framecrc", "-"]
+    done = subprocess.run(call, capture_output=True)
     lines = done.stdout.decode(errors="replace").splitlines()
     unit = next((Fraction(line.split(":")[1].strip()) for line in lines if line.startswith("#tb 0:")), 1)
     ticks = (line.split(",")[2].strip() for line in lines if not line.startswith("#"))
@@ -148,7 +156,7 @@ def sound_of(video: Path, rate: int, most: float) -> np.ndarray:
     """Decode the beginning of a video's sound, one channel: (S,) float32, ``rate`` samples a second from the
     time 0 of its frames on, ``most`` seconds at most; empty where there is none.
     """
-    call = [imageio_ffmpeg.get_ffmpeg_exe(), "-nostdin", "-v", "quiet", "-i", str(video), "-map", "0:a:0"]
+    call = [*ffmpeg_reading(video, "-v", "quiet"), "-map", "0:a:0"]
     call += ["-t", str(most), "-ac", "1", "-af", f"aresample={rate}:async=1:first_pts=0", "-f", "f32le", "-"]
     return np.frombuffer(subprocess.run(call, capture_output=True).stdout, np.float32)
 
@@ -186,10 +194,10 @@ def decode(
         threads, start: see ``extracted``.
     """
     limit = ["-threads", str(threads or 0)]  # of decoder and encoder
-    begin = [imageio_ffmpeg.get_ffmpeg_exe(), "-hide_banner", "-nostdin", "-nostats"]
     shape = ["-map", "0:v:0", "-vf", filters, "-filter_threads", limit[1], "-fps_mode", "passthrough"]
     seek = [] if start is None else ["-ss", f"{start:.6f}"]
-    call = [*begin, *limit, *seek, "-i", str(video), *shape, *limit, "-f", "image2pipe", "-c:v", codec, "-"]
+    call = [*ffmpeg_reading(video, "-nostats", *limit, *seek), *shape, *limit]
+    call += ["-f", "image2pipe", "-c:v", codec, "-"]
     with subprocess.Popen(call, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
         reader = Thread(target=log.read, args=[process.stderr])
         reader.start()

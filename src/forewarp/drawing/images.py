@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from forewarp.files import written_whole
+from forewarp.media import ffmpeg_reading, film_bytes, read_rgb
 
 # Far to near, steadily lighter, so that it also works in grey.
 _DEPTH = ((0.16, 0.11, 0.33), (0.17, 0.36, 0.55), (0.16, 0.61, 0.57), (0.55, 0.80, 0.36), (0.99, 0.91, 0.45))
@@ -257,25 +258,28 @@ def image_size(path: Path) -> tuple[int, int]:
 
 
 def read_image(path: Path) -> Tensor:
-    """Read an image as (H, W, 3) in [0, 1]; alpha is dropped."""
-    return torch.from_numpy(iio.imread(path)[..., :3].copy()).float() / 255
+    """Read a PNG or JPEG as (H, W, 3) in [0, 1]; alpha is dropped. Raises as ``media.read_rgb``."""
+    return torch.from_numpy(read_rgb(path)).float() / 255
 
 
-def smaller_video(path: Path, most: int) -> tuple[bytes, str]:
-    """Encode an ``.mp4`` with more loss, and at last smaller, until it has at most ``most`` bytes.
+def video_within(path: Path, most: int) -> tuple[bytes, str]:
+    """Read an ``.mp4``; encode it with more loss, and at last smaller, until it has at most ``most`` bytes.
 
     Returns:
         the file's bytes, and in words what was changed; no bytes if nothing fits.
 
     Raises:
         OSError: naming ``path``, if ffmpeg cannot read it.
+        ValueError: as ``media.film_bytes``.
     """
+    if len(content := film_bytes(path)) <= most:
+        return content, ""
     with tempfile.TemporaryDirectory(prefix="forewarp-") as folder:
         file = Path(folder) / "video.mp4"
         for shrink, loss in _SMALLER:
             even = f"scale=trunc(iw/{2 * shrink})*2:trunc(ih/{2 * shrink})*2:flags=area"
             options = f"-vf {even} -crf {loss} -pix_fmt yuv420p -movflags +faststart -an".split()
-            call = [imageio_ffmpeg.get_ffmpeg_exe(), "-y", "-v", "error", "-i", str(path)]
+            call = ffmpeg_reading(path, "-y", "-v", "error")
             if subprocess.run([*call, *options, str(file)], capture_output=True).returncode:
                 raise OSError(errno.EIO, "ffmpeg could not read it", str(path))
             if file.stat().st_size <= most:

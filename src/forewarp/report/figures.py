@@ -10,6 +10,7 @@ import numpy as np
 from PIL import Image
 
 from forewarp.files import written_whole
+from forewarp.media import read_rgb
 from forewarp.report.results import Point, Row, Runs, in_words, pairs, read_points
 from forewarp.report.settings import CONDITIONS, SAME
 
@@ -241,8 +242,7 @@ def thirds(sheet):
 
 def _parts(row: Row, view: str, kind: str = "sheets") -> list[np.ndarray]:
     """Read truth, rendering and error of a view of a run, or of its ``depth``."""
-    with Image.open(sheets_of(row["folder"], kind)[view]) as sheet:
-        return thirds(np.asarray(sheet) / 255)
+    return thirds(read_rgb(sheets_of(row["folder"], kind)[view]) / 255)
 
 
 def _show(axes, pictures: Mapping[str, np.ndarray], size: str = "small") -> None:

@@ -107,6 +107,8 @@ def read_story(folder: Path) -> Row:
         row = read_run(folder)
         planned = row["config"].get("stage") or row["stages"]
         stages = [name for name, stage in planned.items() if stage is not None]
+        if others := [name for name in planned if not re.fullmatch(r"\w[\w-]*", str(name))]:
+            raise ValueError(f"stage: expected names of letters, digits, _ and -, but got {others[0]!r:.80}")
         _ = [(d["choice"], d["on"], d["because"]) for d in (row["plan"].get("effects") or {}).values()]
         finished = sum(float(done["seconds"]) for done in row["stages"].values())
         row["trained"] = max([finished, *(point.seconds for point in row["points"])])
@@ -272,7 +274,7 @@ def encoded(media: Media, room: float) -> tuple[list[dict[str, str]], str, str, 
         as ``data:`` addresses the pictures and ``thumb`` of each view, the pictures of each of the worst, and
         the video, "" for none; what became of the pictures and of the video so that they fit.
     """
-    from forewarp.drawing.images import at_most, jpeg_bytes, smaller_video
+    from forewarp.drawing.images import at_most, jpeg_bytes, video_within
 
     def jpeg(picture: Tensor, side: int, quality: int) -> str:
         return _address("image/jpeg", jpeg_bytes(at_most(picture.cpu(), side), quality))
@@ -295,8 +297,7 @@ def encoded(media: Media, room: float) -> tuple[list[dict[str, str]], str, str, 
     if not media.video:
         return views, "", note, ""
     most = int(0.75 * left) - 100  # base64 takes four bytes for three
-    fits = media.video.stat().st_size <= most
-    video, video_note = (media.video.read_bytes(), "") if fits else smaller_video(media.video, most)
+    video, video_note = video_within(media.video, most)
     return views, _address("video/mp4", video) if video else "", note, video_note
 
 

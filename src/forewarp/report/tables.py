@@ -15,6 +15,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 from tabulate import tabulate
 
+from forewarp.media import image_bytes
 from forewarp.metrics.registry import metric_of
 from forewarp.report.statistics import INTERVALS, NETS, Estimate, Factor
 
@@ -221,7 +222,7 @@ def _environment() -> Environment:
         "label": lambda text: "-".join(re.findall("[a-z0-9]+", text.lower())),
         "tex_head": _latex_head,
         "tex_rows": lambda table: table.texts("tex", latex_text),
-        "inlined": lambda path: "data:image/png;base64," + base64.b64encode(path.read_bytes()).decode(),
+        "inlined": lambda path: "data:image/png;base64," + base64.b64encode(image_bytes(path)).decode(),
     }
     return environment
 
