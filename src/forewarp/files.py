@@ -19,6 +19,8 @@ from pathlib import Path
 from reprlib import repr as short
 from typing import TYPE_CHECKING
 
+import yaml
+
 if TYPE_CHECKING:
     import numpy as np
 
@@ -27,9 +29,14 @@ MOST_CONFIG = 1 << 20  # of a config or a plan; ours have a few thousand
 MOST_BYTES = 1 << 26  # of a text that is parsed, which takes up to thirty times as much memory
 MOST_POINTS = 1 << 28  # of a cloud of points as text
 MOST_IMAGE = 1 << 29
+MOST_FILM = MOST_ARCHIVE = 1 << 40
 MOST_ARRAYS = 1 << 30  # of NumPy's files, also when unpacked
+MOST_LEVELS = 40  # of YAML, one within the other
 
 _LEFT = 24 * 3600  # seconds after which nobody fills a folder any more
+_PLAIN_TAGS = {f"tag:yaml.org,2002:{kind}" for kind in ("str", "int", "float", "bool", "null", "map", "seq")}
+_PLAIN_TAGS |= {None, "!"}
+_DIGITS = 4300  # of a number; those of sixty parts take time that grows by the square
 
 
 @contextmanager
@@ -141,19 +148,26 @@ def _is_left(part: Path) -> bool:
 
 
 def refuse_links(folder: Path) -> None:
-    """Refuse a folder in which a link lies, at any depth; the folder itself may be one.
+    """Refuse a folder in which a link, a pipe or a device lies, at any depth; it may be a link itself.
 
-    What is written into a folder that came from someone else then stays in it.
+    What is read from and written into a folder that came from someone else then stays in it.
 
     Raises:
-        ValueError: naming the link.
+        ValueError: naming the file.
     """
     for parent, folders, files in os.walk(folder):
         for name in sorted((*folders, *files)):
-            if os.path.islink(path := os.path.join(parent, name)):
-                expected = "no links inside a run's folder, as files would be written where they lead"
-                got = f"one to {os.readlink(path)}; put the file itself there, or delete the link"
-                raise ValueError(f"{path}: expected {expected}, but got {got}")
+            path = os.path.join(parent, name)
+            with suppress(FileNotFoundError):  # another process may be writing
+                mode = os.lstat(path).st_mode
+                if stat.S_ISLNK(mode):
+                    expected = (
+                        "no links inside a run's folder, as files would be read and written where they lead"
+                    )
+                    got = f"one to {os.readlink(path)}; put the file itself there, or delete the link"
+                    raise ValueError(f"{path}: expected {expected}, but got {got}")
+                if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
+                    raise ValueError(f"{path}: expected a file, but got a device or a pipe; delete it")
 
 
 def check_replaceable(path: Path, mark: str) -> None:
@@ -225,6 +239,60 @@ def load_json(path: Path, top: type = dict) -> dict | list:
         kind = "object" if top is dict else top.__name__
         raise ValueError(f"{path}: expected a JSON {kind} at the top, but got {type(content).__name__}")
     return content
+
+
+class _PlainLoader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):
+    """PyYAML's safe loader without dates, which are texts."""
+
+    yaml_implicit_resolvers = {
+        first: [(tag, pattern) for tag, pattern in kinds if not tag.endswith(":timestamp")]
+        for first, kinds in yaml.SafeLoader.yaml_implicit_resolvers.items()
+    }
+
+
+def load_yaml(path: Path, *, texts: bool = False) -> object:
+    """Read plain data from a YAML file of at most ``MOST_CONFIG`` bytes.
+
+    Args:
+        path: of the file.
+        texts: leave all values as text, as they stand there.
+
+    Raises:
+        OSError: where it cannot be read.
+        ValueError: in one line, for what does not parse, and as ``check_yaml``.
+    """
+    text = read_text(path, MOST_CONFIG)
+    try:
+        check_yaml(text, path)
+        return yaml.load(text, yaml.BaseLoader if texts else _PlainLoader)
+    except (yaml.YAMLError, RecursionError) as error:
+        reason = (str(error).splitlines() or [type(error).__name__])[0]
+        raise ValueError(f"{path}: expected YAML, but got {reason}") from error
+
+
+def check_yaml(text: str, where: object) -> None:
+    """Refuse YAML that holds more than plain data, before any value is made of it.
+
+    Aliases and deep nesting can exhaust memory or the stack, numbers of many digits time; tags make objects
+    of texts.
+
+    Raises:
+        ValueError: naming ``where`` and what came.
+        yaml.YAMLError: for what does not parse.
+    """
+    level = 0
+    for event in yaml.parse(text, Loader=_PlainLoader):
+        if isinstance(event, yaml.AliasEvent):
+            raise ValueError(f"{where}: expected no aliases, but got *{event.anchor}; write it out")
+        if (tag := getattr(event, "tag", None)) not in _PLAIN_TAGS:
+            expected = "YAML of texts, numbers, true, false, null, lists and mappings"
+            raise ValueError(f"{where}: expected {expected}, but got the tag {tag[:80]}; write plain values")
+        is_plain = isinstance(event, yaml.ScalarEvent) and event.implicit[0]
+        if is_plain and len(event.value) > _DIGITS and event.value[0] in "+-.0123456789":
+            raise ValueError(f"{where}: expected numbers of at most {_DIGITS} digits, but got more")
+        level += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
+        if level > MOST_LEVELS:
+            raise ValueError(f"{where}: expected at most {MOST_LEVELS} levels, but got more")
 
 
 def decoded(raw: bytes, path: Path) -> str:

@@ -255,6 +255,26 @@ def test_a_plan_sets_no_code(tmp_path, word):
         read_plan(tmp_path / "plan.yaml", ["theirs"])
 
 
+@pytest.mark.parametrize(
+    "word",
+    [
+        *("++preset.note=${oc.env:HOME}", r"++preset.note=$\{oc.env:HOME\}", "++preset.note='${a}'"),
+        *("++preset.note=[{a: ${oc.env:HOME}}]", "paths.runs=/elsewhere", "paths.runs='/else where'"),
+    ],
+)
+def test_a_plan_reads_no_environment_and_writes_nowhere_else(tmp_path, word):
+    write_plan(tmp_path / "plan.yaml", {"typed": ["data.scene=x"], "overrides": [word], "of": "0"})
+    with pytest.raises(ValueError, match="expected overrides that a plan has.* type it beside plan="):
+        read_plan(tmp_path / "plan.yaml")
+    assert read_plan(tmp_path / "plan.yaml", typed=[word])["overrides"] == [word]
+
+
+def test_a_plan_may_say_that_runs_lie_where_it_does(tmp_path):
+    word = f"paths.runs={tmp_path}"
+    write_plan(tmp_path / "x" / "plan.yaml", {"typed": ["data.scene=x", word], "overrides": [], "of": "0"})
+    assert word in read_plan(tmp_path / "x" / "plan.yaml")["typed"]
+
+
 def test_what_a_plan_composes_names_no_code_of_others(refused, in_tmp):
     """Whatever words lead there: the config of a planned run is looked at before anything is made of it."""
     mine = in_tmp / "mine" / "experiment"

@@ -18,7 +18,16 @@ from forewarp.cli.mistakes import of_another
 from forewarp.cli.view import require_viewer
 from forewarp.data.files import mismatch, number, one_of, scene_folder, whole
 from forewarp.files import MOST_CONFIG, read_text, replace_file
-from forewarp.runs.config import check_planned, check_values, hashed, is_swept, resumed, set_value, trust_of
+from forewarp.runs.config import (
+    check_planned,
+    check_values,
+    hashed,
+    is_swept,
+    refuse_to_synthesize,
+    resumed,
+    set_value,
+    trust_of,
+)
 from forewarp.runs.overrides import key_of, typed_overrides
 
 if TYPE_CHECKING:  # loads torch
@@ -98,6 +107,7 @@ def prepare(config: DictConfig) -> Prepared | None:
     trust = trust_of(config.get("trust"))
     if config.get("planned") is not None:
         check_planned(config, trust)
+        refuse_to_synthesize(config)
     viewer = viewer_of(config)  # as typed: a stored config has none
     config, resumes = resumed(config), config.get("resume") is not None
     refuse_missing_scene(config)

@@ -5,10 +5,11 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from pathlib import Path
+from reprlib import repr as short
 
 import yaml
 
-from forewarp.files import MOST_CONFIG, read_text, replace_file
+from forewarp.files import load_yaml, replace_file
 from forewarp.runs.config import check_target, without_trust
 from forewarp.runs.overrides import command_line, key_of, merged, without_switched_off
 
@@ -34,22 +35,34 @@ def read_plan(file: Path, trust: Sequence[str] = (), typed: Sequence[str] = ()) 
         ValueError: if the file is no plan, or has overrides no plan may have.
     """
     try:
-        made = yaml.safe_load(read_text(file, MOST_CONFIG))
+        made = load_yaml(file)
         overrides = [*made["typed"], *made["overrides"], f"of={made['of']}"]
         others = [override for override in overrides if override not in typed]
         allowed = all(isinstance(override, str) and _is_harmless(override) for override in others)
-    except (OSError, ValueError, yaml.YAMLError, TypeError, KeyError, RecursionError) as error:
-        reason = getattr(error, "strerror", None) or type(error).__name__
+    except (OSError, ValueError, TypeError, KeyError) as error:
+        reason = getattr(error, "strerror", None) or (
+            str(error) if isinstance(error, ValueError) else type(error).__name__
+        )
         told = f"plan: expected a file that forewarp-plan wrote, but got {file} ({reason})"
         raise ValueError(f"{told}; use plan=<folder of a plan>/plan.yaml") from error
     where = f"plan: expected overrides that a plan has, but got others in {file}"
     if not allowed:
         raise ValueError(f"{where}; make it anew")
     for override in others:
+        # What is typed may use the environment and write anywhere, what a file says may not.
+        if "${" in override.replace("\\", ""):
+            raise ValueError(f"{where}: {short(override)}; write the value, or type it beside plan=")
+        if key_of(override) == "paths.runs" and not _holds(override.partition("=")[2], file):
+            raise ValueError(f"{where}: {short(override)}, where the plan does not lie; type it beside plan=")
         if (key := key_of(override)).endswith("._target_"):
             check_target(override.partition("=")[2], where, key, trust)
     names = ("typed", "overrides")
     return made | {name: [word for word in made[name] if key_of(word) != "trust"] for name in names}
+
+
+def _holds(folder: str, file: Path) -> bool:
+    """Tell whether a file lies below a folder, which may be in quotes."""
+    return file.resolve().is_relative_to(Path(folder.strip("'\"")).expanduser().resolve())
 
 
 def _is_harmless(override: str) -> bool:

@@ -14,9 +14,7 @@ from pathlib import Path
 from statistics import fmean
 from typing import NamedTuple
 
-import yaml
-
-from forewarp.files import MOST_CONFIG, read_rows, read_text, replace_file
+from forewarp.files import load_yaml, read_rows, read_text, replace_file
 from forewarp.metrics.registry import metric_of
 from forewarp.report import figures
 from forewarp.report.results import Row, Runs, add_rows, in_words, length, nothing, read_runs
@@ -57,8 +55,8 @@ def read_published(path: Path | None = None) -> list[Published]:
     """
     path = path or OTHERS
     try:
-        return [Published(**entry) for entry in yaml.safe_load(read_text(path, MOST_CONFIG))]
-    except (TypeError, yaml.YAMLError) as error:
+        return [Published(**entry) for entry in load_yaml(path)]
+    except TypeError as error:
         expected, got = f"entries with the keys {', '.join(Published._fields)}", str(error).splitlines()[0]
         raise ValueError(f"{path}: expected {expected}, but got {got}") from None
 

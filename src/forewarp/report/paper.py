@@ -16,9 +16,9 @@ from statistics import fmean
 from typing import NamedTuple
 
 import numpy as np
-import yaml
 
-from forewarp.files import MOST_CONFIG, read_json, read_text, replace_file
+from forewarp.files import load_yaml, read_json, read_text, replace_file
+from forewarp.media import image_bytes
 from forewarp.metrics.registry import metric_of
 from forewarp.report import figures, motion_figures
 from forewarp.report.results import KINDS, Point, Row, Runs, nothing, refused
@@ -119,11 +119,9 @@ def read_paper(path: Path) -> dict[str, PaperTable]:
     """
     try:
         # All values as text, so that 30.50 stays as printed.
-        content = yaml.load(read_text(Path(path), MOST_CONFIG), Loader=yaml.BaseLoader)
+        content = load_yaml(Path(path), texts=True)
         tables, types = content["tables"].items(), content.get("types") or {}
         return {key: _table(key, entry, content["datasets"], types) for key, entry in tables}
-    except yaml.YAMLError as error:
-        raise ValueError(f"{path}: expected YAML, but got {str(error).splitlines()[0]}") from None
     except (KeyError, TypeError, AttributeError) as error:
         raise ValueError(f"{path}: expected tables of groups and rows, but got {error!r}") from None
 
@@ -487,7 +485,7 @@ def _figures(
     sections += others
     for path in sorted(curves.glob("accuracy-time-*.png")) if curves is not None else ():
         if path.parent.resolve() != out.resolve():
-            replace_file(out / path.name, path.read_bytes())
+            replace_file(out / path.name, image_bytes(path))
     if pictures := sorted(out.glob("accuracy-time-*.png")):
         told = "Separate runs, with views held out, of forewarp-report kind=accuracy_time."
         sections.append(Section("Accuracy against training time", pictures=pictures, caption=told))

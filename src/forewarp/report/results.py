@@ -20,9 +20,7 @@ from itertools import chain
 from pathlib import Path
 from typing import NamedTuple
 
-import yaml
-
-from forewarp.files import MOST_CONFIG, load_json, read_json, read_rows, read_text, replace_file
+from forewarp.files import load_json, load_yaml, read_json, read_rows, refuse_links, replace_file
 from forewarp.metrics.registry import described_own, metric_of, take_described
 from forewarp.report.settings import (
     CONDITIONS,
@@ -58,7 +56,7 @@ PROTOCOL += ("canonical_time", "mask_box", "exposure")
 OWN = "run|sheets|paths.runs|paths.data"  # keys that say where a run's files are, not what it is
 # What stands for the folders of whoever types a command again.
 PLACES = {"paths.scenes": "DATASETS", "data.root": "SCENES", "lpips_weights": "WEIGHTS"}
-UNREADABLE = OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError, yaml.YAMLError
+UNREADABLE = OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError
 ENDS = 0.1  # share of the time that counts as its first and last part
 _EARLY, _LATE = 0.95, 1.5  # of its minutes: less was ended by steps, more had a last step that took long
 
@@ -284,13 +282,14 @@ def read_run(folder: Path) -> Row:
     * ``train`` (seconds), ``epe`` (world units), ``torch``, ``effects``, ``protocol``;
     * ``counterpart``: whether the scene is synthetic; ``origin``: its dataset without ``COUNTERPART``.
     """
-    config = yaml.safe_load(read_text(folder / "config.yaml", MOST_CONFIG))
+    refuse_links(folder)
+    config = load_yaml(folder / "config.yaml")
     stages = {file.parent.name: load_json(file) for file in sorted(folder.glob("*/done.json"))}
     metrics = load_json(folder / "metrics.json") if (folder / "metrics.json").is_file() else {}
     take_described(metrics.get("metrics"))
     files = [folder / name for name in ("metrics.json", "score.json") if (folder / name).is_file()]
     measured_at = files[0].stat().st_mtime_ns if files else 0
-    plan = read_text(folder / "plan.yaml", MOST_CONFIG) if (folder / "plan.yaml").is_file() else "{}"
+    plan = load_yaml(folder / "plan.yaml") if (folder / "plan.yaml").is_file() else {}
     points, images = read_points(folder), []
     for image in (read_json(folder / "per_image.json") or {}).get("images", []):
         scores = {name: float(value) for name, value in image["scores"].items() if value is not None}
@@ -311,7 +310,7 @@ def read_run(folder: Path) -> Row:
     stands_in = synthetic and not dataset.startswith("counterpart")
     frames, tested = protocol.get("test_frames"), str(protocol.get("measured", "")).split(" ")[0]
     row = {"folder": folder, "config": config, "stages": stages, "metrics": metrics, "images": images}
-    row |= {"points": points, "plan": yaml.safe_load(plan), "test": test, "measured_at": measured_at}
+    row |= {"points": points, "plan": plan, "test": test, "measured_at": measured_at}
     row |= {"method": method, "preset": preset, "command": command, "ablation": ablation}
     planned = (row["plan"] or {}).get("overrides") or ()
     row["configuration"] = configuration(config, read_json(folder / "data.json"), planned)

@@ -25,7 +25,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from forewarp.data.files import RECORD, mismatch, number, one_of
-from forewarp.files import MOST_CONFIG, read_text, refuse_links
+from forewarp.files import MOST_CONFIG, check_yaml, read_text, refuse_links
 from forewarp.runs.overrides import constant, key_of, typed_overrides
 
 # Two runs differ if these keys differ; device, folder and what is shown do not count.
@@ -39,7 +39,6 @@ HASH = "{hash}"
 MAY_CHANGE = "trainer", "threads", "lpips_weights", "sheets", "views", "reduce", "evaluate", "logger"
 MAY_CHANGE += "trackers", "checkpoint_seconds", "sentinel", "data_changed", "score", "viewer", "host", "port"
 MAY_CHANGE += ("plan_only",)
-MOST_LEVELS = 40
 MOST_SEED = 2**31 - 100  # each stage adds its number, and what finds poses takes 31 bits
 TRUST_VARIABLE = "FOREWARP_TRUST"
 # Allowed beside the classes of forewarp. Listed by full name, as a prefix would allow all of torch.
@@ -190,6 +189,7 @@ def saved_config(
     """
     if run is None:
         raise ValueError("run: expected the folder of a run, but got nothing; set run=runs/...")
+    refuse_links(Path(run))
     path = Path(run) / "config.yaml"
     if not path.is_file():
         raise mismatch(path, "the configuration of a run", "none", f"set {key}=<a run's folder>")
@@ -200,7 +200,6 @@ def saved_config(
     if (changes.get("data") or {}).get("root") is not None:
         saved.data.root = changes.data.root
     saved.run = str(run)
-    refuse_links(Path(run))
     check_values(saved)
     refuse_to_synthesize(saved)
     return saved
@@ -317,7 +316,7 @@ def trusted_config(
             folder.
     """
     try:
-        _check_events(text, where)
+        check_yaml(text, where)
         config = OmegaConf.create(text)
         content = OmegaConf.to_container(config)
     except _UNREADABLE as error:
@@ -375,20 +374,10 @@ def check_planned(config: DictConfig, trust: Sequence[str]) -> None:
     _check(OmegaConf.to_container(config, resolve=True), where, "", trust)
 
 
-def _check_events(text: str, where: Path) -> None:
-    """Refuse aliases and deep nesting, which can exhaust memory or the stack."""
-    level = 0
-    for event in yaml.parse(text, Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader)):
-        if isinstance(event, yaml.AliasEvent):
-            raise ValueError(f"{where}: expected no aliases, but got *{event.anchor}; write it out")
-        level += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
-        if level > MOST_LEVELS:
-            raise ValueError(f"{where}: expected at most {MOST_LEVELS} levels, but got more")
-
-
 def _check(node: object, where: Path, key: str, trust: Sequence[str] | None) -> None:
     if isinstance(node, dict):
         for name, value in node.items():
+            _check_plain(name, where, key)
             inner = f"{key}.{name}" if key else str(name)
             if name == "_target_" and trust is not None:
                 check_target(value, where, inner, trust)
@@ -399,8 +388,16 @@ def _check(node: object, where: Path, key: str, trust: Sequence[str] | None) -> 
     elif isinstance(node, list):
         for i, value in enumerate(node):
             _check(value, where, f"{key}[{i}]", trust)
-    elif isinstance(node, str) and "${" in node:
-        raise ValueError(f"{where}: {key}: expected a plain value, but got {node[:80]}; write the value")
+    else:
+        _check_plain(node, where, key)
+
+
+def _check_plain(value: object, where: Path, key: str) -> None:
+    """Refuse a key or a value that is no plain data, or that would be resolved later."""
+    if not isinstance(value, str | int | float | bool | None) or (isinstance(value, str) and "${" in value):
+        raise ValueError(
+            f"{where}: {key}: expected a plain value, but got {str(value)[:80]}; write the value"
+        )
 
 
 def check_target(name: object, where: Path | str, key: str, trust: Sequence[str]) -> None:
