@@ -69,7 +69,7 @@ def test_depth_of_a_video_is_in_the_units_of_its_poses(tmp_path):
     Image.fromarray(np.full((10, 15), 2, np.uint8)).save(tmp_path / "confidence" / "frame_2.png")
     np.save(tmp_path / "lidar" / "frame_3.npy", np.full((10, 15, 1), 40.0, np.float32))
     scene = read_scene(tmp_path, "toy", depth=str(tmp_path / "lidar"))
-    assert scene.protocol["depth"] == "metric, of 3 of 9 training frames"
+    assert scene.protocol["depth"] == "axis, of 3 of 9 training frames"
     frames = {frame.name: frame for frame in (*scene.train, *scene.test)}
     units = scene.protocol["normalisation"]["scale"]
     for i in (1, 2, 3):
@@ -86,11 +86,11 @@ def test_depth_of_a_video_is_in_the_units_of_its_poses(tmp_path):
         read_scene(tmp_path, "toy")
     (tmp_path / "lidar").rename(folder / "lidar")
     edit(folder / FILE, {"frames.0.depth_file_path": "lidar/frame_1.png"})
-    assert read_scene(tmp_path, "toy").protocol["depth"] == "metric, of 1 of 9 training frames"
+    assert read_scene(tmp_path, "toy").protocol["depth"] == "axis, of 1 of 9 training frames"
     assert "depth" not in read_scene(tmp_path, "toy", depth="off").protocol
     edit(folder / FILE, {"frames.1.depth_file_path": "lidar/none.png"})
     scene = read_scene(tmp_path, "toy")
-    assert scene.protocol["depth"] == "metric, of 1 of 9 training frames"
+    assert scene.protocol["depth"] == "axis, of 1 of 9 training frames"
     (line,) = (line for line in scene.protocol["assumed"] if "depth" in line.rpartition("/")[2])
     assert line.endswith("lidar/none.png: 1 of 2 depths are not there: images go without")
     edit(folder / FILE, {"frames.1.depth_file_path": "lidar/2.exr"})
@@ -120,7 +120,10 @@ def test_confidences_lie_as_depths_do_and_a_depth_is_of_one_image(tmp_path):
     [
         ({"depth": "nowhere"}, "data.depth: expected a folder of depths, but got .*nowhere; set data.depth="),
         ({"depth": "images"}, "images: expected depths|expected a grey PNG of 16 bits"),
-        ({"depth_kind": "deep"}, "data.depth_kind: expected metric, relative or inverse, but got 'deep'"),
+        (
+            {"depth_kind": "deep"},
+            "data.depth_kind: expected axis, ray, relative, inverse or null, but",
+        ),
         ({"depth": "some", "depth_kind": "inverse"}, "data.depth_kind: expected points that never move, to"),
         ({"depth": "some", "depth_scale": 0}, "data.depth_scale: expected"),
         ({"depth": False}, "data.depth: expected a folder, off or null, but got False"),

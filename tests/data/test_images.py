@@ -210,3 +210,12 @@ def test_kept_images_have_pages_of_their_own_which_are_freed_with_them():
     kept = cache.get(owners[-1], lambda: None)
     assert kept.data_ptr() % mmap.PAGESIZE == 0
     torch.testing.assert_close(kept, image, rtol=0, atol=0)
+
+
+def test_a_jpeg_with_a_second_image_inside_is_turned_as_others(tmp_path):
+    image, exif = Image.fromarray(NOISE), Image.Exif()
+    exif[0x0112] = 6
+    image.save(tmp_path / "a.jpg", "MPO", save_all=True, append_images=[image.resize((8, 6))], exif=exif)
+    header = inspect_image(tmp_path / "a.jpg")
+    assert (header.size, header.is_turned) == ((53, 37), True)
+    assert read_image(tmp_path / "a.jpg", upright=True).shape == (53, 37, 4)

@@ -262,3 +262,13 @@ def test_films_of_two_rates_or_none_at_all_are_refused(films, tmp_path):
 def test_cameras_that_the_layout_cannot_tell_are_not_written(tmp_path, change):
     with refused("camera 0: expected square pixels, the principal point"):
         write_poses(tmp_path, [replace(CAMERAS[0], **change)], near=1, far=2)
+
+
+def test_gaps_in_frame_numbers_are_gaps_in_time(folder):
+    assert "assumed" not in read_scene(folder.parent, "toy").protocol
+    for place in folder.glob("cam*"):
+        (place / "0002.png").unlink()
+        (place / "0003.png").unlink()
+    scene = read_scene(folder.parent, "toy")
+    assert scene.times == pytest.approx((0, 0.2, 0.8, 1))
+    assert "times are those of the numbers in the images' names" in scene.protocol["assumed"][0]

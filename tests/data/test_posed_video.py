@@ -2,6 +2,8 @@
 
 import json
 import logging
+import re
+import unicodedata
 from dataclasses import replace
 
 import numpy as np
@@ -571,3 +573,55 @@ def test_a_pattern_reads_times_and_cameras_in_names(tmp_path):
     assert [frame.time for frame in scene.test] == pytest.approx([0, 1 / 3, 2 / 3, 1])
     assert all("1_" in frame.name for frame in scene.test)
     assert scene.protocol["times"] == "from the images' names"
+
+
+def test_names_in_another_unicode_form_are_found(tmp_path):
+    folder = write_video(tmp_path / unicodedata.normalize("NFD", "Größe"))
+    content = json.loads((folder / FILE).read_text())
+    (folder / "masks").mkdir()
+    for i, frame in enumerate(content["frames"]):
+        name = f"Größe_{i:03d}.png"
+        (folder / frame["file_path"]).rename(folder / "images" / unicodedata.normalize("NFD", name))
+        write_image(folder / "masks" / name, np.full((20, 30), 255, np.uint8))
+        frame |= {
+            "file_path": f"images/{name[:-4]}",
+            "mask_path": unicodedata.normalize("NFD", f"masks/{name}"),
+        }
+    (folder / FILE).write_text(json.dumps(content))
+    scene = read_scene(tmp_path, unicodedata.normalize("NFC", "Größe"))
+    assert len(scene.train) + len(scene.test) == 10
+    assert bool(scene.train[0].load_valid().all())
+
+
+def test_absolute_paths_are_read_inside_the_scene_or_what_is_there_is_named(tmp_path):
+    folder = write_video(tmp_path / "toy")
+    name = json.loads((folder / FILE).read_text())["frames"][3]["file_path"]
+    edit(folder / FILE, {"frames.3.file_path": str(folder / name)})
+    assert len(read_scene(tmp_path, "toy").train) == 9
+    for path in (rf"C:\Users\me\toy\{name}", f"/data/toy/{name}", f"../../toy/{name}"):
+        edit(folder / FILE, {"frames.3.file_path": path.replace("/", "\\") if path[0] == "C" else path})
+        with refused(
+            f"path inside the scene folder, but got .*; {name} is there: write paths from the scene"
+        ):
+            read_scene(tmp_path, "toy")
+    edit(folder / FILE, {"frames.3.file_path": "/etc/passwd"})
+    with refused("a path inside the scene folder, but got '/etc/passwd'$"):
+        read_scene(tmp_path, "toy")
+
+
+def test_what_looks_like_masks_depth_or_a_lens_and_is_not_read_is_named(tmp_path):
+    folder = write_video(tmp_path / "toy")
+    assert len(read_scene(tmp_path, "toy").protocol["assumed"]) == 1  # the times alone
+    for i in range(3):
+        write_image(folder / "images" / f"dynamic_mask_frame_{i}.png", np.zeros((20, 30), np.uint8))
+    (folder / "depths").mkdir()
+    (folder / "masks_2").mkdir()
+    change = {"frames.0.mask_filename": "a.png", "frames.1.depth_path": "b.exr", "integer_depth_scale": 0.1}
+    edit(folder / FILE, change | {"k4": 0, "rolling_shutter": [0, 0, 1, 0], "frames.0.masked": None})
+    said = "\n".join(read_scene(tmp_path, "toy").protocol["assumed"])
+    assert "images: dynamic_mask_frame_0.png and 2 more are not read" in said
+    assert "depths/ is not read" in said
+    assert "masks_2/ is not read" in said
+    assert re.search("json: integer_depth_scale, rolling_shutter, mask_filename, depth_path: not read", said)
+    edit(folder / FILE, {"frames.0.mask_path": "masks/a.png"})
+    assert "masks_2/" not in "\n".join(read_scene(tmp_path, "toy", masks="off").protocol["assumed"])

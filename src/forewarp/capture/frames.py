@@ -17,8 +17,8 @@ import numpy as np
 import torch
 from torch.nn.functional import adaptive_max_pool2d, interpolate
 
-from forewarp.data.files import UNREAD, SceneError, mismatch
-from forewarp.data.images import SUFFIXES, bright, by, common_header, read_image, write_image
+from forewarp.data.files import SUFFIXES, UNREAD, SceneError, composed, mismatch
+from forewarp.data.images import bright, by, common_header, read_image, write_image
 from forewarp.data.names import in_order, read_names
 from forewarp.data.video import HDR, Log, decode, deinterlacing, extracted, hdr_of, hdr_unsaid
 from forewarp.drawing.images import at_most
@@ -367,8 +367,8 @@ def write_masks(
         sizes, rows, found, originals: as of ``Frames``.
     """
     paths = images_in(masks, deep=True)
-    by_name = {path.relative_to(masks).with_suffix("").as_posix(): path for path in paths}
-    stems = [Path(originals.get(name, name)).with_suffix("").as_posix() for name in sizes]
+    by_name = {composed(path.relative_to(masks).with_suffix("").as_posix()): path for path in paths}
+    stems = [composed(Path(originals.get(name, name)).with_suffix("").as_posix()) for name in sizes]
     are_named, are_counted = all(stem in by_name for stem in stems), len(paths) == found
     if not are_named and not are_counted:
         expected = f"{found} masks, one for each frame or picture, or masks with the names of the pictures"

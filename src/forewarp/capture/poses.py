@@ -15,7 +15,7 @@ import torch
 from forewarp.capture.frames import Frames, Progress
 from forewarp.data.cameras import check_lens
 from forewarp.data.directions import inverted, opposite, other_readings
-from forewarp.data.files import SceneError, mismatch
+from forewarp.data.files import SceneError, composed, mismatch
 from forewarp.data.images import by
 from forewarp.scene.camera import Camera, Lens
 
@@ -172,7 +172,9 @@ def read_model(folder: Path, originals: Mapping[str, str] | None = None) -> Reco
         raise mismatch(folder, "a COLMAP model", text, "export it again") from error
     if originals is None:
         return Reconstruction.of(model)
-    ours = {original: name for name, original in originals.items()}
+    ours = {composed(original): name for name, original in originals.items()}
+    for image in model.images.values():
+        image.name = composed(image.name)
     posed = {image.name for image in model.images.values() if image.has_pose}
     absent = sorted(posed - ours.keys())
     if len(absent) == len(posed):

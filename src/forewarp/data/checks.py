@@ -11,6 +11,7 @@ from torch import Tensor
 from forewarp.data.cameras import nine_pixels
 from forewarp.data.directions import common_point
 from forewarp.data.files import mismatch
+from forewarp.data.images import by
 from forewarp.data.names import in_order
 from forewarp.scene.box import Box, Lattice
 from forewarp.scene.camera import Camera, focus_point
@@ -24,6 +25,7 @@ _WITHIN = 5  # points along a side of the box that cameras are asked for
 _FAINT = 8  # of 255: alpha that is nowhere above it was written as 0 and 1
 _WIDEST, _ZOOMED = 130, 1.25  # degrees of a pinhole camera; focal lengths of test and training images
 _ASIDE = 0.25  # share of a side by which a principal point is far from the middle
+_CROPPED, _MIDDLE = 0.08, 0.01  # shares by which one of a crop is off, and the other at most
 _STRETCHED, _SAME_PLACE = 1.25, 1e-9  # sides of a pixel; share of the cameras' distance from the origin
 _AROUND = 2  # half a side of a subject's box in distances of the farthest camera from what they look at
 _WALKED, _SLOW = 5, 1  # degrees around what a film shows, in all and a second, that are too few
@@ -80,7 +82,11 @@ def remarks(scene: Scene) -> Iterator[str]:
         yield from _silhouettes(scene, bounded=not aside)
     if masked := [frame.load_valid for frame in scene.train if frame.load_valid is not None]:
         shares = [float(masked[i]().float().mean()) for i in spread(len(masked), _LOOKED_AT)]
-        if (share := sum(shares) / len(shares)) < _FEW:
+        share = sum(shares) / len(shares)
+        if share == 1:
+            line = f"masks hide nothing in all {len(shares)} of the training images looked at"
+            yield f"{line}; write 0 where pixels do not count, or set data.masks=off"
+        if share < _FEW:
             advice = "if dark is what lies beside the subject, set data.masks=alpha"
             line = f"masks leave {share:.0%} of the pixels to train on"
             yield f"{line}; {advice}, if it is the subject, invert them"
@@ -107,6 +113,8 @@ def _pinholes(scene: Scene) -> Iterator[str]:
     if max(abs(across - 0.5), abs(down - 0.5)) > _ASIDE:
         line = f"the principal point lies at {across:.0%} of the width and {down:.0%} of the height"
         yield f"{line}, as of images that were cropped since; subtract what was cut off from cx and cy"
+    elif line := _of_other_shape(cameras[0].width, cameras[0].height, across, down):
+        yield line
     stretched = [frame.camera.fy / frame.camera.fx for frame in scene.train]
     if not 1 / _STRETCHED < (ratio := float(torch.tensor(stretched).median())) < _STRETCHED:
         yield f"pixels are {ratio:.3g} times as wide as high, by their focal lengths; compare both"
@@ -114,6 +122,25 @@ def _pinholes(scene: Scene) -> Iterator[str]:
     if (degrees := math.degrees(2 * math.atan(widest / 2))) > _WIDEST:
         line = f"training images are {degrees:.0f} degrees wide, as if focal lengths were in millimetres"
         yield f"{line}; write them in pixels"
+
+
+def _of_other_shape(width: int, height: int, across: float, down: float) -> str | None:
+    """Say that a principal point, in shares of the sides, is the middle of images of another shape: in the
+    middle of one side and aside on the other, as of images that were cropped.
+    """
+    off = abs(across - 0.5), abs(down - 0.5)
+    if max(off) <= _CROPPED or min(off) > _MIDDLE:
+        return None
+    sides = round(2 * across * width), round(2 * down * height)
+    key, cut = ("cy", sides[1] - height) if off[1] > off[0] else ("cx", sides[0] - width)
+    at = f"the principal point lies at {across:.0%} of the width and {down:.0%} of the height"
+    line = f"{at}: the middle of images of {by(sides)} pixels, where these have {by((width, height))}"
+    what = "rows" if key == "cy" else "columns"
+    advice = f"if {what} were added before the image, add them to {key}"
+    if cut > 0:
+        some = f"{cut} {what} were cut off, subtract from {key} those before the image"
+        advice = f"if {some}, {cut // 2} where both sides lost as many"
+    return f"{line}; {advice}"
 
 
 def _too_wide(scene: Scene, aim: Tensor | None) -> Iterator[str]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 
@@ -11,17 +11,20 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from forewarp.data.agreement import disagreement
 from forewarp.data.arrays import check_shape, load_numpy
-from forewarp.data.files import mismatch
+from forewarp.data.files import existing, mismatch
 from forewarp.data.images import CACHE, by, read_gray16, read_image
 from forewarp.scene.camera import Camera, Lens
 from forewarp.scene.frame import spread
 
 SUFFIXES = (".npy", ".png")
 MILLIMETRES = 1e-3
+METRIC = ("axis", "ray")  # kinds of depth in a unit of length
 LEVELS = 2  # of ARKit's confidence: 0 low, 1 medium, 2 high
 _LOOKED_AT = 4  # files that tell the unit
 _NEAR, _LEAST, _AGREE, _LINES = 0.05, 10, 0.4, 400  # of a fit: share, points, share of them, lines tried
+_VIEWS, _OFF, _BETTER = 6, 0.01, 0.5  # that are compared; error that tells, and a better one as a share of it
 _BEYOND = 2.0  # share of near and far within which the median of depths of the right unit lies
 
 
@@ -32,13 +35,14 @@ class SensedDepth:
     room; it is read-only.
 
     Args:
-        path: .npy (H', W') or (H', W', 1), or grey PNG of 16 bits, of depths along the optical axis; what is
-            0 or not finite is a hole. Its proportions are the image's, of which each pixel takes the nearest.
+        path: .npy (H', W') or (H', W', 1), or grey PNG of 16 bits, of depths; what is 0 or not finite is a
+            hole. Its proportions are the image's, of which each pixel takes the nearest.
         camera: of the image.
         scale: world units for one unit of the file.
         confidence: .npy or grey PNG as large: from 0 to 1, or ARKit's levels 0, 1, 2; None: 1 everywhere.
-        kind: ``metric``; or, but for a scale and a shift, ``relative`` as depth or ``inverse`` as 1 / depth:
-            what is 0 or below is no hole then, and what lies at ``known`` points tells scale and shift.
+        kind: along the optical ``axis`` or the pixel's ``ray``; or, but for a scale and a shift, ``relative``
+            as depth or ``inverse`` as 1 / depth along the axis: what is 0 or below is no hole then, and what
+            lies at ``known`` points tells scale and shift.
         known: (N, 3), world units. An image that shows too few of them, or contradicts them, is all holes.
     """
 
@@ -46,7 +50,7 @@ class SensedDepth:
     camera: Camera
     scale: float = 1.0
     confidence: Path | None = None
-    kind: str = "metric"
+    kind: str = "axis"
     known: Tensor | None = None
 
     def __call__(self) -> Tensor:
@@ -54,7 +58,7 @@ class SensedDepth:
         return CACHE.get(self, self._decode)
 
     def _decode(self) -> Tensor:
-        depth = read_depth(self.path, signed=self.kind != "metric")
+        depth = read_depth(self.path, signed=self.kind not in METRIC)
         trust = np.ones_like(depth) if self.confidence is None else _read_confidence(self.confidence)
         if trust.shape != depth.shape:
             expected = f"{by(depth.shape[::-1])} confidences as {self.path.name}"
@@ -63,11 +67,12 @@ class SensedDepth:
         if abs(depth.shape[0] * size[1] - depth.shape[1] * size[0]) > max(*depth.shape, *size):
             expected = f"depths of the proportions of its image, {by(size[::-1])} pixels"
             raise mismatch(self.path, expected, by(depth.shape[::-1]))
-        if self.kind != "metric":
+        if self.kind not in METRIC:
             depth = self._fitted(depth)
         planes = torch.from_numpy(np.stack([depth * self.scale, trust * (depth > 0)]).astype(np.float32))
         planes = torch.nn.functional.interpolate(planes[None], size, mode="nearest-exact")[0]
-        planes[0] /= _cosines(*camera.inner)
+        if self.kind != "ray":
+            planes[0] /= _cosines(*camera.inner)
         return planes
 
     def _fitted(self, values: np.ndarray) -> np.ndarray:
@@ -116,6 +121,30 @@ def line_through(given: np.ndarray, true: np.ndarray) -> tuple[float, float] | N
     columns = np.stack([given[best] / true[best], 1 / true[best]], 1)  # errors count by their share
     a, b = np.linalg.lstsq(columns, np.ones(len(columns)), rcond=None)[0]
     return float(a), float(b)
+
+
+def refuse_other_kind(depths: Sequence[SensedDepth], known: Tensor | None, where: object) -> None:
+    """Refuse depth taken for that along the axis of which views agree much better if it is along the rays.
+
+    Args:
+        depths: of images, of which some are read.
+        known: points (N, 3) that never move, world units.
+        where: of the error.
+
+    Raises:
+        SceneError: naming the key.
+    """
+    some, errors = [depths[i] for i in spread(len(depths), _VIEWS)], {}
+    for kind in METRIC:
+        planes = [replace(depth, kind=kind)()[0] for depth in some]
+        errors[kind] = disagreement([depth.camera for depth in some], planes, known)
+    axis, ray = (errors[kind] for kind in METRIC)
+    if axis is not None and ray is not None and axis > _OFF and ray < _BETTER * axis:
+        got = (
+            f"depths of which views differ by {axis:.1%}, and by {ray:.1%} if they are along the pixels' rays"
+        )
+        advice = "set data.depth_kind=ray, or data.depth_kind=axis if they are right"
+        raise mismatch(where, "depths along the optical axis", got, advice)
 
 
 def depths_beside(folder: Path, names: Sequence[str]) -> dict[str, Path]:
@@ -172,7 +201,7 @@ def _beside(folder: Path, name: str) -> Path | None:
 
 
 def _stored(folder: Path, name: str) -> Path | None:
-    paths = (folder / f"{name}{suffix}" for suffix in SUFFIXES)
+    paths = (existing(folder / f"{name}{suffix}") for suffix in SUFFIXES)
     return next((path for path in paths if path.is_file()), None)
 
 

@@ -36,7 +36,15 @@ from forewarp.data.cameras import (
 from forewarp.data.directions import check_directions, common_point
 from forewarp.data.files import mismatch, nearly, number, one_of, read_json, remove, scene_folder, whole
 from forewarp.data.images import StoredImage, alpha_of, by, check_pixels, inspect_image, write_image
-from forewarp.data.transforms import ListedImage, check_times, hold_out_every, image_of, read_frames, times_of
+from forewarp.data.transforms import (
+    ListedImage,
+    check_times,
+    hold_out_every,
+    image_of,
+    read_frames,
+    times_of,
+    unread_beside,
+)
 from forewarp.files import write_json
 from forewarp.scene.box import Box
 from forewarp.scene.camera import Camera
@@ -150,7 +158,7 @@ def read_scene(
     protocol = {"dataset": "dnerf", "resolution": [width, height], "half_resolution": halve}
     is_moved = space.scale != 1 or any(space.center)
     protocol |= {"test_frames": len(test), "normalisation": space.told if is_moved else None}
-    protocol["assumed"] = assumed or None
+    protocol["assumed"] = [*dict.fromkeys(assumed)] or None
     truth = read_truth(folder / "trajectories.npz", canonical)
     return Scene(scene, train, val, test, bounds, canonical, has_alpha, truth, protocol, world=space)
 
@@ -286,6 +294,7 @@ def _read_file(path: Path, ability: str, **options) -> tuple[list[_Record], list
     if ours := [key for key in ("near", "far", "aabb") if content.get(key) is not None]:
         keys = "data.near, data.far and data.box"
         assumed.append(f"{path}: {', '.join(ours)} left aside, as this layout has none; set {keys}")
+    assumed += unread_beside(path, content, [image.path for image in images])
     for image in images:
         entry, depth, mask = image.entry, None, None
         if "depth_file_path" in entry.own:

@@ -8,15 +8,16 @@ import json
 import os
 import re
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
+from functools import lru_cache
 from math import inf, isfinite
 from numbers import Integral
 from pathlib import Path
 from reprlib import repr as short
 from typing import BinaryIO
-from unicodedata import category
+from unicodedata import category, normalize
 
 from forewarp.files import MOST_BYTES, check_size, load_json
 
@@ -29,8 +30,14 @@ LAYOUTS = {  # what people call a layout: a file or folder that every scene of i
     "COLMAP": ("sparse", "forewarp-capture images=<its images> colmap=<its sparse/0>"),
     "DyNeRF": ("poses_bounds.npy", "experiment=multicam"),
 }
+SUFFIXES = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")
 # Suffixes of images that are not read.
 UNREAD = {".webp", ".tif", ".tiff", ".heic", ".heif", ".avif", ".bmp", ".gif", ".jxl", ".jp2", ".exr"}
+# Names of files, folders and keys of masks and depth, as programs call them.
+SIDE = re.compile(
+    r"(?i)(?:^|[^a-z])(?:dynamic_?|motion_?|resized_?)?(mask|depth|disparity|disp|matte|segm?|segmentation)"
+    r"(?:s|_?maps?)?(?![a-z])"
+)
 RECORD = "synthesis.json"  # of every synthesised scene, or folder of them
 LOCK = ".lock"  # of every folder of a run
 _UNPRINTABLE = {"Cc", "Cs", "Zl", "Zp"}  # control characters, surrogates, line and paragraph separators
@@ -163,17 +170,60 @@ def numbers_of(words: list[str], count: int, where: str) -> list[float]:
 
 
 def inside(folder: Path, name: object, where: str) -> Path:
-    """Join a relative path to ``folder``; refuse one that leads out of it.
+    """Join a path to ``folder``; refuse one that leads out of it.
 
     Judged by the text alone, so a folder may link to where its images really are. A backslash separates, as
-    files written on Windows have it.
+    files written on Windows have it. A file whose name is there in another Unicode form is that.
     """
     is_text = isinstance(name, str) and not any(category(c) in _UNPRINTABLE for c in name)
     normal = os.path.normpath(name.replace("\\", "/")) if is_text and name else ".."
+    if os.path.isabs(normal):
+        for home in (os.path.abspath(folder), os.path.realpath(folder)):
+            normal = normal.removeprefix(os.path.join(home, ""))
     is_drive = re.match("[A-Za-z]:", normal)  # of Windows
     if is_drive or os.path.isabs(normal) or normal.split(os.sep)[0] in ("..", "."):
-        raise mismatch(where, "a path inside the scene folder", short(name))
-    return folder / normal
+        raise mismatch(where, "a path inside the scene folder", short(name), _end_inside(folder, normal))
+    return existing(folder / normal)
+
+
+def _end_inside(folder: Path, path: str) -> str:
+    """Say which end of a path that leads elsewhere is there in ``folder``; nothing where there is none."""
+    parts = [part for part in path.split(os.sep) if part not in ("", "..", ".")]
+    ends = (os.path.join(*parts[i:]) for i in range(len(parts)))
+    for end in ends:
+        if any((folder / f"{end}{suffix}").is_file() for suffix in ("", *SUFFIXES)):
+            return f"{end} is there: write paths from the scene's folder on"
+    return ""
+
+
+def existing(path: Path) -> Path:
+    """Find the file or folder of this name in another Unicode form, as macOS writes it; else the path itself.
+
+    >>> existing(Path("/"))
+    PosixPath('/')
+    """
+    if str(path).isascii() or os.path.lexists(path) or path == path.parent:
+        return path
+    parent = existing(path.parent)
+    with suppress(OSError):
+        names = _names_in(str(parent), parent.stat().st_mtime_ns)
+        return parent / names.get(composed(path.name), path.name)
+    return path
+
+
+def composed(name: str) -> str:
+    """Return a name in the Unicode form in which names are compared, NFC.
+
+    >>> composed("o\u0308") == "\u00f6"
+    True
+    """
+    return normalize("NFC", name)
+
+
+@lru_cache(16)
+def _names_in(folder: str, changed: int) -> dict[str, str]:
+    """Return the names in a folder by their composed form; ``changed`` tells its states apart."""
+    return {composed(name): name for name in os.listdir(folder)}
 
 
 @dataclass(frozen=True)
@@ -213,6 +263,32 @@ class Entry:
         return inside(self.file.parent, self.get(key), self.where(key))
 
 
+def side_files(folders: Iterable[Path], read: Iterable[Path], advice: str) -> list[str]:
+    """Say in lines which files and sub-folders look like masks or depth and are not read.
+
+    Args:
+        folders: that are looked at.
+        read: files and folders that are read; smaller copies (``masks_2``) are, too.
+        advice: what to do.
+    """
+    lines, names = [], {path.name for path in read}
+    known = {re.sub(r"_\d+$", "", str(folder)) for path in read for folder in (path, *path.parents)}
+    for folder in dict.fromkeys(folders):
+        with suppress(OSError):
+            there = (e for e in os.scandir(folder) if SIDE.search(e.name) and not e.name.startswith("."))
+            there = sorted((e for e in there if e.name not in names), key=lambda e: e.name)
+            files = [e.name for e in there if Path(e.name).suffix.lower() in _LISTED and e.is_file()]
+            inner = [e for e in there if e.is_dir() and re.sub(r"_\d+$", "", e.path) not in known]
+            lines += [f"{e.path}/ is not read, which seems to be masks or depth" for e in inner]
+            some = (
+                f"{files[0]} and {len(files) - 1} more are"
+                if files[1:]
+                else f"{'' if not files else files[0]} is"
+            )
+            lines += [f"{folder}: {some} not read, which seem to be masks or depth"] if files else []
+    return [f"{line}; {advice}" for line in lines]
+
+
 def stated(content: Mapping) -> dict:
     """Leave out keys whose value is null: they say nothing."""
     return {key: value for key, value in content.items() if value is not None}
@@ -246,7 +322,7 @@ def scene_folder(root: str | Path, scene: str, layout: str) -> Path:
     root, (marker, _) = Path(root), LAYOUTS[layout]
     if not root.is_dir():
         raise mismatch("data.root", "an existing folder", root, "set data.root")
-    folder = root / scene
+    folder = existing(root / scene)
     if scene and (folder / marker).is_file():
         return folder
     there = ", ".join(sorted(p.name for p in root.iterdir() if (p / marker).is_file())) or "none"

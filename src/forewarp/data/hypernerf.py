@@ -42,6 +42,7 @@ from forewarp.data.files import (
     read_json,
     remove,
     scene_folder,
+    side_files,
     whole,
 )
 from forewarp.data.images import (
@@ -197,6 +198,10 @@ def read_scene(
         extra = Entry(folder / "extra.json", read_json(folder / "extra.json"))
         seconds = (last - first) / extra.number("fps", *_RATES)
     assumed += exif_turned(turned, images)
+    known = [folder / name for name in ("confidence", *([] if depth is None else [depth]))]
+    assumed += side_files(
+        [folder, images], known, "set data.depth (data=iphone) for depth, cut masks into alpha"
+    )
     if ways := other_readings(poses, _READINGS):
         line = "cameras do not look at one thing, as all of them do if"
         assumed.append(f"{folder / 'camera'}: {line} {', or if '.join(ways)}; if so, write them anew")

@@ -24,7 +24,6 @@ from forewarp.media import MOST_PIXELS, TooManyPixels, open_image
 from forewarp.ops.grid import block_means, block_sums
 from forewarp.scene.frame import spread
 
-SUFFIXES = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")
 TURN = "width and height are exchanged: turn its pixels by 90 degrees"
 _OTHER_KINDS = {  # at which byte, which marks tell them
     "WebP": (8, b"WEBP"),
@@ -398,6 +397,7 @@ class MovingMask(StoredMask):
 def bright(path: Path, size: tuple[int, int] | None = None, of_alpha: bool = False) -> Tensor:
     """Decode what is foreground in a mask, (H, W) bool: where it is above 127; in one with colours, as a
     palette has them for several objects, whatever is not black; in one of small numbers, whatever is not 0.
+    Of a mask of one colour whose alpha varies the alpha counts.
 
     Args:
         path: of the mask.
@@ -408,6 +408,8 @@ def bright(path: Path, size: tuple[int, int] | None = None, of_alpha: bool = Fal
         SceneError: as ``read_image``.
     """
     rgba = read_image(path, size)
+    if not of_alpha and bool((rgba[..., 3] != rgba[0, 0, 3]).any()):
+        of_alpha = bool((rgba[..., :3] == rgba[0, 0, :3]).all())
     values = rgba[..., 3] if of_alpha else rgba[..., :3].amax(-1)
     is_colored = not of_alpha and int((values - rgba[..., :3].amin(-1)).max()) >= _COLORED
     least = _COLORED if is_colored else (_FOREGROUND + 1 if int(values.max()) > _NUMBERED else 1)
@@ -459,7 +461,7 @@ def _inspect(stream: BinaryIO, path: Path, mode: str = "RGBA") -> Header:
         raise mismatch(path, "8 bits a channel, grey or RGB", got, "convert the image")
     is_turned = False
     with suppress(Exception):  # a harmed tag, of what no pixel depends on; of a PNG asking would decode it
-        is_turned = image.format == "JPEG" and image.getexif().get(_ORIENTATION, 1) not in (0, 1)
+        is_turned = image.format in ("JPEG", "MPO") and image.getexif().get(_ORIENTATION, 1) not in (0, 1)
     header, is_whole = Header(image.size, image.has_transparency_data, is_turned), False
     with suppress(Exception):  # OSError, SyntaxError and more
         is_whole = image.verify() is None if image.format == "PNG" else _has_jpeg_end(stream)

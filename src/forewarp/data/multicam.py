@@ -1,32 +1,53 @@
 """Rigs of fixed cameras in the layout of DyNeRF (Neural 3D Video): a video for each camera, and their poses.
 
-``poses_bounds.npy`` has a row of 17 numbers for each camera, in the order of the videos' names: 3 x 5 numbers
-[R | T | (height, width, focal length)], row by row, and the depths of the nearest and the farthest matter.
-[R|T] is camera-to-world, the axes of a camera are LLFF's: down, right, backwards. The middle of an image is
-its principal point.
+``poses_bounds.npy`` has a row of 17 numbers for each camera, in the order of the videos' names, by number or
+as texts: 3 x 5 numbers [R | T | (height, width, focal length)], row by row, and the depths of the nearest and
+the farthest matter. [R|T] is camera-to-world, the axes of a camera are LLFF's: down, right, backwards. The
+middle of an image is its principal point.
 
 A camera is a video ``cam00.mp4``, or a folder of its frames ``cam00/`` or ``cam00/images/``, as preprocessors
-leave them; a folder goes before a video. All cameras film at once: frame n of each is moment n.
+leave them; a folder goes before a video. All cameras film at once: frame n of each is moment n; times follow
+films' stamps or images' numbers.
 """
 
 from __future__ import annotations
 
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import torch
+from torch import Tensor
 
+from forewarp.data.agreement import SIDE, photo_error
 from forewarp.data.arrays import check_shape, load_numpy
 from forewarp.data.cameras import MOST_UNITS, box_of, number_or_none, pose_of, space_of
 from forewarp.data.directions import inverted, refuse_other_readings
-from forewarp.data.files import mismatch, number, one_of, scene_folder, whole
+from forewarp.data.files import (
+    SUFFIXES,
+    SceneError,
+    mismatch,
+    number,
+    one_of,
+    scene_folder,
+    side_files,
+    whole,
+)
 from forewarp.data.films import STORE, Film
-from forewarp.data.images import CACHE, SUFFIXES, TURN, StoredImage, by, exif_turned, inspect_image
-from forewarp.data.names import in_order
+from forewarp.data.images import (
+    CACHE,
+    TURN,
+    StoredImage,
+    by,
+    exif_turned,
+    inspect_image,
+    read_image,
+)
+from forewarp.data.names import in_order, read_names
 from forewarp.data.rigs import held_cameras, held_moments, split_rig
 from forewarp.data.video import VIDEOS, extracted, stamps_of
 from forewarp.files import written_whole
@@ -34,6 +55,8 @@ from forewarp.scene.camera import Camera
 from forewarp.scene.frame import Frame, Scene, middle_of
 
 FILE = "poses_bounds.npy"
+_AGREES = 0.8  # error of the right order as a share of the other's, at most
+_EVEN = 0.1  # frames by which even times may be off
 _MOST_APART = 0.5  # frames by which two videos may run apart
 # A camera's axes down, right, backwards to OpenCV's, and back.
 _AXES = torch.tensor([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]], dtype=torch.float64)
@@ -74,6 +97,7 @@ def read_scene(
     test_cameras: Sequence[str] | None = None,
     test_moments: Sequence[int] | None = None,
     test_every: int = 1,
+    camera_order: str | None = None,
     near: float | None = None,
     far: float | None = None,
     box: Sequence[float] | None = None,
@@ -88,6 +112,8 @@ def read_scene(
         test_cameras: names of the cameras held out; None: the first.
         test_moments: numbers of the moments, from 0, that no camera is trained on; None: none.
         test_every: measure held-out cameras at every n-th moment only.
+        camera_order: of the rows of poses: by the ``number`` in the cameras' names, or as ``text`` (cam1,
+            cam10, cam2); None: where these differ, that in which neighbouring views agree.
         near, far: along the unit ray, the file's units; None: what holds all depths of the file.
         box: x0 y0 z0 x1 y1 z1 in the file's units; None takes all that the cameras see from near to far.
         normalise: put what is looked at into the origin and the farthest camera at distance 1.
@@ -101,11 +127,13 @@ def read_scene(
     one_of(normalise, "data.normalise", True, False)
     scale, every = whole(scale, "data.scale", 1), whole(test_every, "data.test_every", 1)
     paths = _paths(folder)
-    whole_cameras = _read_rows(folder / FILE, list(paths))
+    one_of(camera_order, "data.camera_order", "number", "text", None)
     tracks = [_look(path) for path in paths.values()]
+    whole_cameras, ordered = _ordered_rows(folder / FILE, dict(zip(paths, tracks)), camera_order)
     count, assumed = _moments(tracks, None if frames is None else whole(frames, "data.frames", 1), folder)
     turned = [path for track in tracks for path in track.images[:count] if path in track.turned]
-    assumed += exif_turned(turned, folder)
+    assumed += ordered + exif_turned(turned, folder)
+    assumed += side_files([folder], [], "this layout has none: use experiment=video_with_poses for them")
     held, moments = held_cameras(test_cameras, list(paths), [0]), held_moments(test_moments, count)
     factors = [_factor(track, camera, scale) for track, camera in zip(tracks, whole_cameras)]
     cameras = [camera.smaller(scale) for camera in whole_cameras]
@@ -132,9 +160,11 @@ def read_scene(
     space, seen = space_of(cameras, str(folder / FILE), **options)
     cameras = [space.camera(camera) for camera in cameras]
 
+    times, line = _times(tracks, count, folder)
+    assumed += line
+
     def view(moment: int, k: int) -> Frame:
-        time = moment / max(count - 1, 1)
-        return Frame(tracks[k].name(moment), time, cameras[k], loads[k][moment], camera_id=k)
+        return Frame(tracks[k].name(moment), times[moment], cameras[k], loads[k][moment], camera_id=k)
 
     taken = ((moment, view(moment, k)) for moment in range(count) for k in range(len(cameras)))
     train, test = split_rig(taken, held, moments, every)
@@ -231,6 +261,50 @@ def _read_rows(path: Path, names: Sequence[str]) -> list[Camera]:
     return cameras
 
 
+def _ordered_rows(
+    path: Path, tracks: Mapping[str, _Track], order: str | None
+) -> tuple[list[Camera], list[str]]:
+    """Read the camera of each of ``tracks``, in their order; also say in a line in which order rows were
+    taken where names allow two.
+
+    Raises:
+        SceneError: as ``_read_rows``, and where neighbouring views do not tell.
+    """
+    cameras = _read_rows(path, list(tracks))
+    texts = sorted(tracks)
+    if order == "number" or texts == list(tracks):
+        return cameras, []
+    by_text = dict(zip(texts, _read_rows(path, texts)))
+    by_text = [by_text[name] for name in tracks]
+    if order == "text":
+        return by_text, []
+    images = [_small_image(track) for track in tracks.values()]
+    views = [
+        [camera.resized(*image.shape[1::-1]) for camera, image in zip(all_of, images)]
+        for all_of in (cameras, by_text)
+    ]
+    numbered, as_texts = (photo_error(of, images) for of in views)
+    if not min(numbered, as_texts) < _AGREES * max(numbered, as_texts):  # both may be infinite
+        orders = f"{', '.join([*tracks][:3])} by number, {', '.join(texts[:3])} as texts"
+        got = f"{orders}, and images that do not tell"
+        advice = "set data.camera_order=number or data.camera_order=text"
+        raise mismatch(path, "rows in one order of the cameras", got, advice)
+    which, chosen = ("number", cameras) if numbered < as_texts else ("text", by_text)
+    line = f"rows are taken in the order of the cameras' names by {which}, as neighbouring views agree so"
+    return chosen, [f"{path}: {line}; else set data.camera_order"]
+
+
+def _small_image(track: _Track) -> Tensor:
+    """Read the first frame of a camera, a few pixels wide: (H, W, 3) in [0, 1]."""
+    if track.stamps is None:
+        pixels = read_image(track.images[0])[..., :3]
+    else:
+        pixels = torch.from_numpy(next(extracted(track.path, [0], None)))
+    width, height = (max(1, round(side * SIDE / max(track.size))) for side in track.size)
+    planes = pixels.permute(2, 0, 1)[None].float() / 255
+    return torch.nn.functional.interpolate(planes, (height, width), mode="area")[0].permute(1, 2, 0)
+
+
 def _look(path: Path) -> _Track:
     """Find the size and number of a camera's frames."""
     if path.is_dir():
@@ -279,6 +353,27 @@ def _moments(tracks: Sequence[_Track], most: int | None, folder: Path) -> tuple[
                 advice = "remove a frame that one camera lacks from all"
                 raise mismatch(track.path, expected, mine.name, advice)
     return count, assumed
+
+
+def _times(tracks: Sequence[_Track], count: int, folder: Path) -> tuple[list[float], list[str]]:
+    """Return the times in [0, 1] of ``count`` moments: by the stamps of a film, or by the numbers of images;
+    also say in a line where these are not even.
+    """
+    film = next((track for track in tracks if track.stamps is not None), None)
+    clock, even = np.arange(count), np.arange(count) / max(count - 1, 1)
+    if film is not None:
+        clock = film.stamps[:count]
+    else:
+        with suppress(SceneError):  # names that do not tell
+            read = read_names([image.stem for image in tracks[0].images[:count]], str(folder))
+            clock = clock if read is None else np.array(read.frames)
+    if count < 2 or not (np.diff(clock) > 0).all():
+        return even.tolist(), []
+    times = (clock - clock[0]) / (clock[-1] - clock[0])
+    if np.abs(times - even).max() * (count - 1) <= _EVEN:
+        return even.tolist(), []
+    what = "the films' time stamps" if film else "the numbers in the images' names"
+    return times.tolist(), [f"{folder}: times are those of {what}, which are not even"]
 
 
 def _factor(track: _Track, camera: Camera, scale: int) -> int:

@@ -27,9 +27,19 @@ from torch import Tensor
 
 from forewarp.data.arrays import read_cloud, write_array
 from forewarp.data.cameras import MOST_UNITS, SPLITS, box_of, number_or_none, opengl_rows, space_of
-from forewarp.data.depth import LEVELS, MILLIMETRES, SensedDepth, confidence_of, depths_beside, depths_named
+from forewarp.data.depth import (
+    LEVELS,
+    METRIC,
+    MILLIMETRES,
+    SensedDepth,
+    confidence_of,
+    depths_beside,
+    depths_named,
+    refuse_other_kind,
+)
 from forewarp.data.directions import check_directions
 from forewarp.data.files import (
+    SUFFIXES,
     inside,
     mismatch,
     number,
@@ -41,7 +51,6 @@ from forewarp.data.files import (
     whole,
 )
 from forewarp.data.images import (
-    SUFFIXES,
     MovingMask,
     StoredImage,
     StoredMask,
@@ -54,7 +63,15 @@ from forewarp.data.images import (
 )
 from forewarp.data.names import in_order, read_names
 from forewarp.data.rigs import held_cameras, held_moments, split_rig
-from forewarp.data.transforms import ListedImage, check_times, hold_out_every, image_of, read_frames, times_of
+from forewarp.data.transforms import (
+    ListedImage,
+    check_times,
+    hold_out_every,
+    image_of,
+    read_frames,
+    times_of,
+    unread_beside,
+)
 from forewarp.files import write_json
 from forewarp.scene.box import Box
 from forewarp.scene.camera import Camera
@@ -106,7 +123,7 @@ def read_scene(
     masks: str | None = None,
     alpha: str | None = None,
     depth: str | None = None,
-    depth_kind: str = "metric",
+    depth_kind: str | None = None,
     depth_scale: float | None = None,
 ) -> Scene:
     """Read ``root/scene``; pixels are decoded when a frame is first loaded, masks at once.
@@ -137,11 +154,12 @@ def read_scene(
             those of ``mask_path`` ignore, as nerfstudio's do; alpha is alpha, unless there is an image
             beneath it, which is refused.
         alpha: colours are ``straight`` or ``premultiplied``; None: as the edges of some images show.
-        depth: folder, of any place or in the scene's, of training images' depth along the optical axis, .npy
-            or PNG of 16 bits, named as they are; a folder ``confidence`` beside it is read likewise. None:
-            ``depth_file_path`` of the frames, where they have it; ``off``: none is used.
-        depth_kind: ``metric``, in the file's units; ``relative``, but for a scale and a shift of each image;
-            ``inverse``, 1 / depth likewise. Points that never move tell both.
+        depth: folder, of any place or in the scene's, of training images' depth, .npy or PNG of 16 bits,
+            named as they are; a folder ``confidence`` beside it is read likewise. None: ``depth_file_path``
+            of the frames, where they have it; ``off``: none is used.
+        depth_kind: in the file's units along the optical ``axis`` or the pixel's ``ray``; ``relative``, but
+            for a scale and a shift of each image; ``inverse``, 1 / depth likewise. Points that never move
+            tell both. None: along the axis, unless views agree much better along rays, which is refused.
         depth_scale: units of the file for one unit of a metric depth; None: a thousandth of a PNG, 1 of .npy.
 
     Raises:
@@ -151,12 +169,15 @@ def read_scene(
     one_of(scale, "data.scale", *SCALES)
     whole(test_every, "data.test_every", 2)
     one_of(normalise, "data.normalise", True, False)
-    one_of(depth_kind, "data.depth_kind", "metric", "relative", "inverse")
+    one_of(depth_kind, "data.depth_kind", *METRIC, "relative", "inverse", None)
+    is_metric = depth_kind in (*METRIC, None)
+    if not isinstance(depth, (str, Path, type(None))):
+        raise mismatch("data.depth", "a folder, off or null", repr(depth))
     file = scene_folder(root, scene, "nerfstudio") / FILE
     content = stated(read_json(file))
     entries, absent, assumed = _read_entries(file, content, scale, axes, inverse, masks)
-    if (file.parent / "masks").is_dir() and not any("mask_path" in f for f in content["frames"]):
-        assumed.append(f"{file}: masks/ is there, but no frame has a mask_path: they are not used")
+    beside = [] if depth in (None, "off") else [file.parent / depth]
+    assumed += unread_beside(file, content, [entry.path for entry in entries], beside)
     cut_out = [entry.load for entry in entries if entry.is_cut_out]
     premultiplied, told = alpha_of(alpha, [load.path for load in cut_out], file)
     assumed += told
@@ -198,27 +219,25 @@ def read_scene(
 
     cloud = _points_of(file, content)
     still = None if cloud is None else space.to_scene(read_cloud(cloud, 3)).float()
-    if not isinstance(depth, (str, Path, type(None))):
-        raise mismatch("data.depth", "a folder, off or null", repr(depth))
     depths, place = {}, None if depth in (None, "off") else file.parent / depth
     if depth is None:
         depths, lines = depths_named({e.name: e.depth for e in parts["train"] if e.depth is not None})
         assumed += lines
     elif place is not None:
         depths = depths_beside(place, [entry.name for entry in parts["train"]])
-    if depths and depth_kind != "metric" and still is None:
-        advice = "write points.npy, or set data.depth_kind=metric"
+    if depths and not is_metric and still is None:
+        advice = "write points.npy, or set data.depth_kind=axis"
         raise mismatch("data.depth_kind", "points that never move, to fit depth to", "none", advice)
 
     def sensed(name: str, camera: Camera) -> SensedDepth | None:
         if (path := depths.get(name)) is None:
             return None
         unit = 1.0
-        if depth_kind == "metric":
+        if is_metric:
             unit = (MILLIMETRES if path.suffix == ".png" else 1.0) if depth_scale is None else depth_scale
             unit = number(unit, "data.depth_scale", 1 / MOST_UNITS, MOST_UNITS) * space.scale
         top = place or file.parent / path.relative_to(file.parent).parts[0]
-        return SensedDepth(path, camera, unit, confidence_of(path, top), depth_kind, still)
+        return SensedDepth(path, camera, unit, confidence_of(path, top), depth_kind or "axis", still)
 
     def frame(e: ImageEntry) -> Frame:
         camera_id, camera = None if e.taken_by is None else views.index(e.taken_by), space.camera(e.camera)
@@ -226,6 +245,8 @@ def read_scene(
         return Frame(e.name, e.time, camera, e.load, **beside, camera_id=camera_id, moment=e.moment)
 
     train, val, test = (tuple(map(frame, parts[split])) for split in SPLITS)
+    if depths and depth_kind is None:
+        refuse_other_kind([f.load_sensed for f in train if f.load_sensed], still, place or file)
     ranks = {time: n for n, time in enumerate(sorted({*times}))}
     moments = {e.name: ranks[e.time] if e.moment is None else e.moment for e in entries}
     held = held_cameras(test_cameras, views, []), held_moments(test_moments, max(moments.values()) + 1)
@@ -258,7 +279,7 @@ def read_scene(
         "masks": train[0].load_valid and ignored,
         "moving": train[0].load_moving and moving_from,
         "seconds": number_or_none(content.get("seconds"), f"{file}: seconds"),
-        "depth": f"{depth_kind}, of {count} of {len(train)} training frames" if depths else None,
+        "depth": f"{depth_kind or 'axis'}, of {count} of {len(train)} training frames" if depths else None,
         "assumed": [*assumed, *filter(None, [told])] or None,
     }
     return Scene(scene, train, val, test, seen, start, has_alpha, protocol=protocol, still=still, world=space)

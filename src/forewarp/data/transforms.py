@@ -21,8 +21,18 @@ import numpy as np
 import torch
 
 from forewarp.data.cameras import FLIP, check_camera, pose_of
-from forewarp.data.files import Entry, frames_of, mismatch, nearly, one_of
-from forewarp.data.images import SUFFIXES, TURN, Header, by, exif_turned, inspect_image
+from forewarp.data.files import (
+    SIDE,
+    SUFFIXES,
+    Entry,
+    existing,
+    frames_of,
+    mismatch,
+    nearly,
+    one_of,
+    side_files,
+)
+from forewarp.data.images import TURN, Header, by, exif_turned, inspect_image
 from forewarp.data.names import LEAST_SPAN, in_order, read_names, refuse_far
 from forewarp.ops.backend import is_number
 from forewarp.scene.camera import Camera, Lens
@@ -36,6 +46,9 @@ _NO_PINHOLE = re.compile(
     "(?i)fish|equi(dist|rect|sol)|pano|spheric|omnidir|ortho|lat_?long|cylind|kannala|thin_?prism|ftheta"
 )
 _UNREAD_LENSES = ("distortion_params", "distortion", "dist_coeffs", "distortion_coefficients", "dist")
+_LIKE_LENS = re.compile(r"(?i)(k[4-9]|.*distort.*|dist_?coe.*|rolling_shutter.*|ocam.*|xi)")
+_PATHS = ("file_path", "mask_path", "depth_file_path", "moving_path", "resting_path")
+_READ = {*_PATHS, "depth_scale", *_UNREAD_LENSES}  # or told elsewhere
 # Matrices of intrinsics, as programs call them.
 _INNER = ("cam_K", "K", "intrinsics", "intrinsic", "intrinsic_matrix", "camera_intrinsics", "camera_matrix")
 _FOCAL = ("fl_x", "fl_y", "camera_angle_x")
@@ -105,6 +118,38 @@ def read_frames(
     for key in like_times[:1]:
         assumed.append(f"{file}: {key} of the frames is not read; call it time, if it is that")
     return images, assumed + left_aside((image.entry, image.camera) for image in images)
+
+
+def unread_beside(
+    file: Path, content: dict, images: Sequence[Path], beside: Sequence[Path] = ()
+) -> list[str]:
+    """Say in lines which keys of a file, and which files beside its images, look like masks, depth or a lens
+    and are not read.
+
+    Args:
+        file, content: of the frames.
+        images: that are read.
+        beside: folders that are read as well.
+    """
+    entries = frames_of(file, content)
+    named = [entry.own.get(key) for entry in entries for key in _PATHS]
+    read = [*images, *beside, file.parent / "confidence"]
+    read += [file.parent / os.path.normpath(path) for path in named if isinstance(path, str)]
+    folders = [file.parent, *(image.parent for image in images)]
+    lines = side_files(folders, read, "name them in each frame by mask_path or depth_file_path")
+    keys = dict.fromkeys([*content, *(key for entry in entries for key in entry.own)])
+    like = [key for key in keys if key not in _READ and (SIDE.search(key) or _LIKE_LENS.fullmatch(key))]
+
+    def is_said(value: object) -> bool:
+        values = value if isinstance(value, list) else [value]
+        return any(each not in (None, False, 0, "") for each in values)
+
+    like = [key for key in like if any(is_said(entry.get(key)) for entry in entries)]
+    if not like:
+        return lines
+    advice = "masks are read from mask_path, depth from depth_file_path, a lens from k1 k2 k3 p1 p2"
+    said = f"{', '.join(like[:4])}: not read, which seem to be masks, depth or a lens"
+    return [f"{file}: {said}; {advice}", *lines]
 
 
 def image_of(entry: Entry, key: str, scale: int = 1) -> Path:
@@ -313,8 +358,8 @@ def pose_in(entry: Entry, axes: str | None, inverse: bool) -> torch.Tensor:
 def with_suffix(path: Path) -> Path:
     """Find an image whose suffix a path may leave out; a PNG where none is there."""
     if path.suffix in SUFFIXES:
-        return path
-    named = [path.with_name(path.name + suffix) for suffix in SUFFIXES]
+        return existing(path)
+    named = [existing(path.with_name(path.name + suffix)) for suffix in SUFFIXES]
     return next((candidate for candidate in named if os.path.isfile(candidate)), named[0])
 
 
