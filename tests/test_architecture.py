@@ -7,7 +7,16 @@ from pathlib import Path
 import pytest
 
 SOURCE = Path(__file__).parents[1] / "src" / "forewarp"
-BOTTOM = {"archives", "clock", "files", "interrupts", "media", "progress", "provenance"}  # open to all
+BOTTOM = {
+    "archives",
+    "clock",
+    "files",
+    "interrupts",
+    "media",
+    "outline",
+    "progress",
+    "provenance",
+}  # open to all
 LOWER = {"ops", "scene", "losses", "metrics", "fields", "drawing", "renderer"}
 MAY_IMPORT = {
     **dict.fromkeys([*BOTTOM, "ops"], set()),

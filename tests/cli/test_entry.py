@@ -14,6 +14,7 @@ import pytest
 from hydra import initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
 from hydra.errors import HydraException
+from jinja2 import UndefinedError
 from lightning.pytorch.loggers import mlflow
 from omegaconf import OmegaConf
 
@@ -269,6 +270,14 @@ def test_interruption_says_how_to_go_on(forewarp, monkeypatch, in_tmp, by, numbe
         (OSError(errno.ENOSPC, "No space left", "x/last.ckpt"), "x/last.ckpt: expected room to write, but"),
         (PermissionError(errno.EACCES, "Permission denied", "x"), "x: expected a usable file or folder, but"),
         (ImportError("install forewarp[synth]"), "install forewarp[synth]"),
+        (
+            RuntimeError("Could not determine home directory."),
+            "~: expected a user with a home folder, but got",
+        ),
+        (
+            UndefinedError("'x' is undefined"),
+            "runs: expected files as forewarp-train and forewarp-evaluate write",
+        ),
         (ModuleNotFoundError("No module named 'trimesh'"), "No module named 'trimesh'; install it with make"),
     ],
 )

@@ -97,6 +97,27 @@ def test_an_address_on_which_nothing_can_listen_is_refused(monkeypatch, where, s
         check_address(**where)
 
 
+def test_a_malformed_message_takes_one_line(viewer, tmp_path, caplog):
+    from websockets.exceptions import ConnectionClosed
+    from websockets.sync.client import connect
+
+    messages = [b"\xff", "text", b"\x80", b"\x81\xa4type\xa1x", b"\x93\x01\x02\x03"]
+    with serving(viewer, tmp_path) as address:
+        for message in messages:
+            protocol = f"viser-v{viser.__version__}"
+            page = connect(address.replace("http", "ws"), subprotocols=[protocol], origin=address)
+            with page, contextlib.suppress(ConnectionClosed):
+                page.send(message)
+                for _ in range(1000):
+                    page.recv(10)  # until it is closed
+    said = [record for record in caplog.records if record.levelname == "ERROR"]
+    assert len(said) == len(messages)
+    assert all(record.exc_info is None for record in said)
+    assert {record.getMessage().partition(" (")[0] for record in said} == {
+        "warning: expected a message of a page, but got another"
+    }
+
+
 def test_pages_of_foreign_sites_are_sent_nothing(viewer, tmp_path):
     from websockets.exceptions import InvalidStatus
     from websockets.sync.client import connect

@@ -226,6 +226,9 @@ def one_line(error: BaseException) -> str | None:
         advice = "lower stage.*.density, or with model=forward data.rays or stage.*.num_voxels, and run the "
         advice += "same command again"
         return f"memory: expected room for {wanted[1] if wanted else 'more'}, but got none; {advice}"
+    if type(error).__module__.partition(".")[0] == "jinja2":
+        got = f"others, which a page cannot show ({flat(str(error))}); leave that run's folder out"
+        return f"runs: expected files as forewarp-train and forewarp-evaluate write them, but got {got}"
     if isinstance(error, RuntimeError) and "home directory" in str(error):  # pathlib's
         return "~: expected a user with a home folder, but got none; write the whole path"
     if isinstance(error, TypeError) and "unexpected keyword argument" in str(error):

@@ -12,12 +12,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from hydra.core.hydra_config import HydraConfig
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
 from forewarp.cli.mistakes import of_another
 from forewarp.cli.view import require_viewer
 from forewarp.data.files import mismatch, number, one_of, scene_folder, whole
 from forewarp.files import MOST_CONFIG, read_text, replace_file
+from forewarp.outline import check_outline
 from forewarp.runs.config import (
     check_planned,
     check_values,
@@ -147,6 +148,7 @@ def prepare(config: DictConfig) -> Prepared | None:
 
 def refuse_all(config: DictConfig) -> None:
     """Refuse what is wrong with a config by itself, whatever the data."""
+    check_outline(OmegaConf.to_container(config, resolve=False))
     for key, choices in CHOICES.items():
         one_of(config.get(key, choices[0]), key, *choices)
     refuse_seeds(config)

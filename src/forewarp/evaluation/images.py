@@ -19,6 +19,7 @@ from forewarp.drawing.images import (
     write_png,
 )
 from forewarp.methods.method import HasTrajectories, Method, Snapshot
+from forewarp.ops.backend import is_number
 from forewarp.scene.camera import Camera, focus_point, mean_up, orbit, swing
 from forewarp.scene.frame import Frame, spread
 from forewarp.scene.view import Moment, Rendering, Target, View
@@ -212,9 +213,10 @@ class TrainingImages(lightning.Callback):
         psnr_views: int = 4,
         psnr_rays: int = 4096,
     ) -> None:
-        if not all(0 <= moment <= 1 for moment in moments):
-            got = list(moments)
-            raise ValueError(f"callbacks.pictures.moments: expected numbers in [0, 1], but got {got}")
+        are_numbers = isinstance(moments, Sequence) and all(map(is_number, moments))
+        if not are_numbers or not all(0 <= moment <= 1 for moment in moments):
+            expected = "callbacks.pictures.moments: expected a list of numbers in [0, 1]"
+            raise ValueError(f"{expected}, but got {moments!r:.80}")
         if psnr_views < 0 or psnr_rays < 1:
             expected, got = "psnr_views >= 0 and psnr_rays >= 1", f"{psnr_views=}, {psnr_rays=}"
             raise ValueError(f"callbacks.pictures: expected {expected}, but got {got}")

@@ -415,7 +415,8 @@ def check_effects(key: str, given: Sequence[str], names: Sequence[str]) -> None:
     Raises:
         ValueError: naming the key.
     """
-    check_value(key, list(given), f"some of {', '.join(names)}", set(names).issuperset)
+    effects = list(given) if isinstance(given, Sequence) and not isinstance(given, str) else [given]
+    check_value(key, effects, f"some of {', '.join(names)}", lambda some: all(one in names for one in some))
 
 
 def steps_of(

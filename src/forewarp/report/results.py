@@ -22,6 +22,7 @@ from typing import NamedTuple
 
 from forewarp.files import load_json, load_yaml, read_json, read_rows, refuse_links, replace_file
 from forewarp.metrics.registry import described_own, metric_of, take_described
+from forewarp.outline import check_outline
 from forewarp.report.settings import (
     CONDITIONS,
     SAME,
@@ -56,7 +57,7 @@ PROTOCOL += ("canonical_time", "mask_box", "exposure")
 OWN = "run|sheets|paths.runs|paths.data"  # keys that say where a run's files are, not what it is
 # What stands for the folders of whoever types a command again.
 PLACES = {"paths.scenes": "DATASETS", "data.root": "SCENES", "lpips_weights": "WEIGHTS"}
-UNREADABLE = OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError
+UNREADABLE = OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError, OverflowError
 ENDS = 0.1  # share of the time that counts as its first and last part
 _EARLY, _LATE = 0.95, 1.5  # of its minutes: less was ended by steps, more had a last step that took long
 
@@ -284,6 +285,7 @@ def read_run(folder: Path) -> Row:
     """
     refuse_links(folder)
     config = load_yaml(folder / "config.yaml")
+    check_outline(config, f"{folder / 'config.yaml'}: ")
     stages = {file.parent.name: load_json(file) for file in sorted(folder.glob("*/done.json"))}
     metrics = load_json(folder / "metrics.json") if (folder / "metrics.json").is_file() else {}
     take_described(metrics.get("metrics"))

@@ -15,6 +15,7 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
 from hydra.utils import get_object, instantiate
 from lightning.pytorch.profilers import AdvancedProfiler, SimpleProfiler
+from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from omegaconf import DictConfig, OmegaConf
 
 from forewarp.clock import Clock
@@ -85,7 +86,7 @@ def build_run(config: DictConfig) -> Run:
     data = instantiate(config.data, _convert_="all")
     data.frames_folder = frames_folder(config)
     plans = {name: stage_of(name, stage) for name, stage in config.stage.items() if stage is not None}
-    factories = [make for make in instantiate(config.callbacks, _convert_="all").values() if make is not None]
+    factories = instantiate(config.callbacks, _convert_="all")
     trainer = instantiate(config.trainer, _convert_="all")
     name = config.trainer.get("profiler")
     one_of(name, "trainer.profiler", *PROFILERS, None)
@@ -98,10 +99,11 @@ def build_run(config: DictConfig) -> Run:
         off |= {"limit_val_batches": 0, "num_sanity_val_steps": 0}
         off |= {"max_epochs": 1, "max_steps": -1, "plugins": [SingleProcess()]}
         # With auto, Lightning would choose a Mac's GPU, which lacks float64.
-        return trainer(accelerator=device().type, **own, **off)
+        return made("trainer", trainer, accelerator=device().type, **own, **off)
 
     def make_callbacks(name: str, folder: Path) -> list:
-        callbacks = [make() for make in factories]
+        known = {f"callbacks.{key}": make for key, make in factories.items() if make is not None}
+        callbacks = [made(key, make) for key, make in known.items()]
         for callback in callbacks:
             if isinstance(callback, StageProgress):
                 callback.later = seconds_after(run.stages, name)
@@ -118,7 +120,7 @@ def build_run(config: DictConfig) -> Run:
         callbacks=make_callbacks,
         seed=config.seed,
         checkpoint_seconds=config.checkpoint_seconds,
-        skip=config.get("sentinel", {"skip": 0})["skip"],
+        skip=(config.get("sentinel") or {"skip": 0})["skip"],
         tell=partial(print, flush=True),
         clock=Clock(config.budget.clock).kind,
         place=device,
@@ -129,6 +131,21 @@ def build_run(config: DictConfig) -> Run:
     )
     run.check()
     return run
+
+
+def made(key: str, make: Callable, **options) -> object:
+    """Call what a key of the config names, with the values below it.
+
+    Raises:
+        ValueError: naming the key, for values of a kind that it does not take.
+    """
+    try:
+        return make(**options)
+    except (TypeError, AttributeError, OverflowError, MisconfigurationException) as error:
+        got = " ".join(str(error).split())
+        raise ValueError(
+            f"{key}: expected values of the kinds that it takes, but got others: {got}"
+        ) from error
 
 
 def frames_folder(config: DictConfig) -> Path:

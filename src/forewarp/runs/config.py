@@ -26,6 +26,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from forewarp.data.files import RECORD, mismatch, number, one_of
 from forewarp.files import MOST_CONFIG, check_yaml, read_text, refuse_links
+from forewarp.outline import check_outline
 from forewarp.runs.overrides import constant, key_of, typed_overrides
 
 # Two runs differ if these keys differ; device, folder and what is shown do not count.
@@ -239,6 +240,7 @@ def read_config(path: Path, trust: Sequence[str] | None = (), unused: Sequence[s
         ValueError: if the file is no config of a run, or names untrusted code.
     """
     config = trusted_config(read_text(path, MOST_CONFIG), path, trust, unused)
+    check_outline(OmegaConf.to_container(config), f"{path}: ")
     for key in (*IDENTITY, "trainer", "callbacks"):
         if key not in config and key != "objective":  # a method may have no objective
             raise ValueError(f"{path}: expected the key {key}, but got none; delete the run's folder")

@@ -11,6 +11,7 @@ from typing import Any
 import torch
 
 from forewarp.methods.method import Model, check_least, check_number
+from forewarp.ops.backend import is_number
 from forewarp.training.objective import Objective
 
 _ENDS = 0.05  # of all time, at its beginning and at its end
@@ -221,7 +222,9 @@ class Curriculum:
     ) -> None:
         shares = {"all_in": all_in, "newest_share": newest_share, "error_share": error_share}
         shares |= {"ends_share": ends_share}
-        if not (start >= 1 and all(0 <= share <= 1 for share in shares.values()) and 0 < newest_part <= 1):
+        are_numbers = all(map(is_number, (start, newest_part, *shares.values())))
+        are_shares = are_numbers and all(0 <= share <= 1 for share in shares.values())
+        if not (are_shares and start >= 1 and 0 < newest_part <= 1):
             expected = "expected start >= 1, newest_part in (0, 1]"
             expected = f"{where}: {expected}, {', '.join(shares)} in [0, 1]"
             got = ", ".join(f"{name}={value}" for name, value in shares.items())

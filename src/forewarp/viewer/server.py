@@ -7,6 +7,7 @@ import errno
 import gzip
 import io
 import ipaddress
+import logging
 import secrets
 import socket
 import time
@@ -55,6 +56,34 @@ class _Server(viser.ViserServer):
         return None
 
 
+class _InOneLine(logging.Filter):
+    """Say in one line that a page sent what is no message, in place of the traceback of its connection."""
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        """Rewrite a record that has an exception; let all pass."""
+        if record.exc_info and record.exc_info[1] is not None:
+            kind = type(record.exc_info[1]).__name__
+            record.msg, record.args = "warning: expected a message of a page, but got another (%s)", (kind,)
+            record.exc_info = record.exc_text = None
+        return True
+
+
+@contextlib.contextmanager
+def _malformed_in_one_line() -> Iterator[None]:
+    """Let what goes wrong with a page's messages take one line on stderr."""
+    loggers, in_one_line = (
+        [logging.getLogger(name) for name in ("websockets.server", "asyncio")],
+        _InOneLine(),
+    )
+    for logger in loggers:
+        logger.addFilter(in_one_line)
+    try:
+        yield
+    finally:
+        for logger in loggers:
+            logger.removeFilter(in_one_line)
+
+
 @contextlib.contextmanager
 def serve(viewer: Viewer, *, host: str, port: int, title: str, folder: Path) -> Iterator[str]:
     """Serve pages of a viewer, each with its own camera, time and image; yields the address.
@@ -88,7 +117,8 @@ def serve(viewer: Viewer, *, host: str, port: int, title: str, folder: Path) -> 
             if page is not None:
                 page.session.close()
 
-        yield url(host, server.get_port())
+        with _malformed_in_one_line():
+            yield url(host, server.get_port())
     finally:
         viewer.queue.close()
         with contextlib.redirect_stdout(io.StringIO()):  # commands have words of their own
