@@ -237,7 +237,7 @@ CONFIG = "data: {scene: a}, model: {name: b}, seed: 0"
         ("per_image.json", '{"images": [{"name": "a"}]}', "no key 'scores'"),
         ("config.yaml", "a: [", "expected a run whose files can be read"),
         ("plan.yaml", "effects: {motion: {choice: x}}", "no key 'on'"),
-        ("config.yaml", f"{{{CONFIG}, preset: null, budget: {{}}}}", "not subscriptable"),
+        ("config.yaml", f"{{{CONFIG}, preset: null, budget: {{}}}}", "preset: expected keys of its own"),
         ("coarse/done.json", '{"steps": 3}', "no key 'seconds'"),
         ("config.yaml", f"{{{CONFIG}, preset: {{name: c}}, budget: {{minutes: x}}}}", "must be real number"),
     ],

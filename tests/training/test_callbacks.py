@@ -170,7 +170,8 @@ def test_the_clock_stands_still_while_something_is_shown(tmp_path, monkeypatch):
     ("make", "text"),
     [
         (lambda: Scalars(every=0), "scalars.every: expected a whole number >= 1, but got 0"),
-        (lambda: TrainingImages(moments=(0.5, 1.5)), r"moments: expected numbers in \[0, 1\], but got"),
+        (lambda: TrainingImages(moments=(0.5, 1.5)), r"moments: expected a list of numbers in \[0, 1\], but"),
+        (lambda: TrainingImages(moments="0.5"), r"moments: expected a list of numbers in .*, but got '0.5'"),
         (lambda: TrainingImages(psnr_rays=0), "expected psnr_views >= 0 and psnr_rays >= 1, but got"),
         (lambda: TrainingImages(moments=(0.1,), view=7), "pictures.view: expected 0 to 0, but got 7"),
     ],

@@ -219,6 +219,7 @@ REFUSED = [
     (curriculum, {"iterations_per_time": 0}, "x.iterations_per_time: expected a whole number >= 1, but got"),
     (curriculum, {"most": 0}, "x.most: expected a whole number >= 1, but got 0"),
     *((curriculum, {key: value}, "x: expected start >= 1, ") for key, value in BAD_SHARES.items()),
+    (curriculum, {"newest_part": "\x1b[31m"}, "x: expected start >= 1, newest_part in"),
 ]
 
 
