@@ -52,7 +52,7 @@ def test_rows_of_a_rig_are_in_the_order_in_which_views_agree(tmp_path, by):
     texts = sorted(range(12), key=lambda k: f"cam{k + 1}")
     write_rig(tmp_path / "toy", range(12) if by == "number" else texts)
     scene = read_rig(tmp_path, "toy", scale=1)
-    assert [line for line in scene.protocol["assumed"] if f"order of the cameras' names by {by}" in line]
+    assert [line for line in scene.protocol["assumed"] if f"order of names by {by}" in line]
     for frame in (*scene.train, *scene.test):
         expected = placed(scene, CAMERAS[int(frame.name[3:].split("/")[0]) - 1]).camera_to_world
         torch.testing.assert_close(frame.camera.camera_to_world, expected)

@@ -368,3 +368,21 @@ def test_another_layout_is_named(tmp_path):
     assert layout_of(tmp_path / "toy") == "D-NeRF"
     with refused("this is a scene in the layout of D-NeRF: use experiment=dnerf"):
         posed_video.read_scene(tmp_path, "toy")
+
+
+@pytest.mark.parametrize(
+    ("file", "said"),
+    [
+        ("toy/keyframes/images/1.jpg", "keyframes is of Polycam's raw data: ns-process-data polycam"),
+        ("toy/EXR_RGBD/rgb/0.png", "EXR_RGBD is of Record3D's EXR export: export .r3d instead"),
+        ("toy/x_droid.npz", "of MegaSaM: write its cameras and images as transforms.json"),
+        ("toy_sgd_cvd_hr.npz", "of MegaSaM: write"),
+        ("toy/train_meta.json", "CMU Panoptic"),
+    ],
+)
+def test_what_other_programs_leave_names_the_way(tmp_path, file, said):
+    (tmp_path / file).parent.mkdir(parents=True, exist_ok=True)
+    (tmp_path / file).touch()
+    for reader in (dnerf, posed_video):
+        with refused(said):
+            reader.read_scene(tmp_path, "toy")

@@ -29,7 +29,29 @@ LAYOUTS = {  # what people call a layout: a file or folder that every scene of i
     "nerfstudio": ("transforms.json", "experiment=video_with_poses"),
     "COLMAP": ("sparse", "forewarp-capture images=<its images> colmap=<its sparse/0>"),
     "DyNeRF": ("poses_bounds.npy", "experiment=multicam"),
+    "LLFF": ("poses_bounds.npy", "experiment=video_with_poses"),  # one camera: a row for each of images/
 }
+# What other programs leave: who, files or folders by which it is known, and the way from there.
+_WRITE = "write its cameras and images as transforms.json (docs/own-data.md says how)"
+_FOREIGN = (
+    ("Polycam's raw data", "keyframes/", "ns-process-data polycam --data {0} --output-dir OUT, then OUT"),
+    ("Record3D's EXR export", "EXR_RGBD/", "export .r3d instead, for forewarp-capture video=SCAN.r3d"),
+    ("Record3D's export", "rgbd/", "zip it to SCAN.r3d with metadata, for forewarp-capture video=SCAN.r3d"),
+    ("MegaSaM", "*_droid.npz", f"{_WRITE}: images, cam_c2w (OpenCV's axes), intrinsic, depths"),
+    ("MegaSaM", "*sgd_cvd*.npz", f"{_WRITE}: images, cam_c2w (OpenCV's axes), intrinsic, depths"),
+    ("ARKitScenes", "lowres_wide*/", _WRITE),
+    ("TUM's RGB-D data", "groundtruth.txt", _WRITE),
+    ("CMU Panoptic for Dynamic 3D Gaussians", "train_meta.json", _WRITE),
+    ("light field videos", "models.json", _WRITE),
+    ("NeuS or IDR", "cameras*.npz", _WRITE),
+    ("3D Gaussian Splatting's output", "cameras.json", _WRITE),
+    (
+        "Metashape",
+        "*.xml",
+        "ns-process-data metashape --data IMAGES --xml {0}/FILE.xml --output-dir OUT, then OUT",
+    ),
+    ("an archive", "*.npz", f"{_WRITE}, if it has cameras"),
+)
 SUFFIXES = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")
 # Suffixes of images that are not read.
 UNREAD = {".webp", ".tif", ".tiff", ".heic", ".heif", ".avif", ".bmp", ".gif", ".jxl", ".jp2", ".exr"}
@@ -323,12 +345,14 @@ def scene_folder(root: str | Path, scene: str, layout: str) -> Path:
     if not root.is_dir():
         raise mismatch("data.root", "an existing folder", root, "set data.root")
     folder = existing(root / scene)
-    if scene and (folder / marker).is_file():
+    if scene and ((folder / marker).is_file() or (layout == "nerfstudio" and layout_of(folder) == "LLFF")):
         return folder
     there = ", ".join(sorted(p.name for p in root.iterdir() if (p / marker).is_file())) or "none"
     advice = f"scenes in {root}: {there}"
     if scene and (other := layout_of(folder)):
         advice = f"this is a scene in the layout of {other}: use {LAYOUTS[other][1]}"
+    elif scene and (known := way_from(folder)):
+        advice = known
     if deeper := sorted(root.glob(f"*/{glob.escape(scene)}/{marker}")) if scene else []:
         advice = f"did you mean data.root={deeper[0].parents[len(Path(scene).parts)]}?"
     if (root / marker).is_file():
@@ -339,7 +363,22 @@ def scene_folder(root: str | Path, scene: str, layout: str) -> Path:
 
 def layout_of(folder: Path) -> str | None:
     """Name the layout of a scene's folder by the file that every scene of it has; None: of none known."""
-    return next((name for name, (marker, _) in LAYOUTS.items() if (folder / marker).exists()), None)
+    name = next((name for name, (marker, _) in LAYOUTS.items() if (folder / marker).exists()), None)
+    is_one_camera = name == "DyNeRF" and (folder / "images").is_dir() and not any(folder.glob("cam*"))
+    return "LLFF" if is_one_camera else name
+
+
+def way_from(folder: Path) -> str:
+    """Say which program left a folder, or files of its name beside, and how to come from there to a scene;
+    nothing where that is not known.
+    """
+    for who, mark, way in _FOREIGN:
+        is_folder, mark = mark.endswith("/"), mark.rstrip("/")
+        beside = folder.parent.glob(f"{glob.escape(folder.name)}{mark}") if mark.startswith("*") else ()
+        found = next((path for path in (*folder.glob(mark), *beside) if path.is_dir() == is_folder), None)
+        if found is not None:
+            return f"{found.name} is of {who}: {way.format(found.parent)}"
+    return ""
 
 
 def remove(folder: Path, *patterns: str) -> None:

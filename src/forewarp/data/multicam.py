@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,6 +30,7 @@ from forewarp.data.directions import inverted, refuse_other_readings
 from forewarp.data.files import (
     SUFFIXES,
     SceneError,
+    layout_of,
     mismatch,
     number,
     one_of,
@@ -52,9 +53,10 @@ from forewarp.data.rigs import held_cameras, held_moments, split_rig
 from forewarp.data.video import VIDEOS, extracted, stamps_of
 from forewarp.files import written_whole
 from forewarp.scene.camera import Camera
-from forewarp.scene.frame import Frame, Scene, middle_of
+from forewarp.scene.frame import Frame, Scene, middle_of, spread
 
 FILE = "poses_bounds.npy"
+_COMPARED = 24  # views, at most, by which an order is told
 _AGREES = 0.8  # error of the right order as a share of the other's, at most
 _EVEN = 0.1  # frames by which even times may be off
 _MOST_APART = 0.5  # frames by which two videos may run apart
@@ -129,7 +131,9 @@ def read_scene(
     paths = _paths(folder)
     one_of(camera_order, "data.camera_order", "number", "text", None)
     tracks = [_look(path) for path in paths.values()]
-    whole_cameras, ordered = _ordered_rows(folder / FILE, dict(zip(paths, tracks)), camera_order)
+    images = lambda: [small_image(_first_image(track)) for track in tracks]  # noqa: E731
+    key = "set data.camera_order=number or data.camera_order=text"
+    whole_cameras, ordered = ordered_rows(folder / FILE, list(paths), images, camera_order, key)
     count, assumed = _moments(tracks, None if frames is None else whole(frames, "data.frames", 1), folder)
     turned = [path for track in tracks for path in track.images[:count] if path in track.turned]
     assumed += ordered + exif_turned(turned, folder)
@@ -221,7 +225,9 @@ def _paths(folder: Path) -> dict[str, Path]:
         found |= {} if inner is None else {path.name: inner}
     if not found:
         expected = "a video for each camera, cam00.mp4, or a folder of its frames, cam00/"
-        raise mismatch(folder, expected, "neither")
+        is_other = layout_of(folder) == "LLFF"
+        advice = "of images/ by one camera that moves: use experiment=video_with_poses" if is_other else ""
+        raise mismatch(folder, expected, "neither", advice)
     return {name: found[name] for name in in_order(found)}
 
 
@@ -230,7 +236,7 @@ def _images(folder: Path) -> list[Path]:
     return in_order((path for path in there if path.suffix in SUFFIXES), lambda path: path.name)
 
 
-def _read_rows(path: Path, names: Sequence[str]) -> list[Camera]:
+def read_rows(path: Path, names: Sequence[str]) -> list[Camera]:
     """Read the cameras of whole images, their near and far the depths of the nearest and the farthest matter.
 
     Raises:
@@ -261,48 +267,54 @@ def _read_rows(path: Path, names: Sequence[str]) -> list[Camera]:
     return cameras
 
 
-def _ordered_rows(
-    path: Path, tracks: Mapping[str, _Track], order: str | None
+def ordered_rows(
+    path: Path, names: Sequence[str], images: Callable[[], list[Tensor]], order: str | None, key: str
 ) -> tuple[list[Camera], list[str]]:
-    """Read the camera of each of ``tracks``, in their order; also say in a line in which order rows were
-    taken where names allow two.
+    """Read the cameras of rows, in the order of names by numbers; also say in a line in which order rows
+    were taken where names allow two.
+
+    Args:
+        path: of the rows.
+        names: of cameras or images, in the order of their numbers.
+        images: small ones, (H, W, 3) in [0, 1] each, by which the order is told.
+        order: of the rows: ``number``, ``text``, or None: that in which neighbouring views agree.
+        key: what to do where they do not tell.
 
     Raises:
-        SceneError: as ``_read_rows``, and where neighbouring views do not tell.
+        SceneError: as ``read_rows``, and where neighbouring views do not tell.
     """
-    cameras = _read_rows(path, list(tracks))
-    texts = sorted(tracks)
-    if order == "number" or texts == list(tracks):
+    cameras, texts = read_rows(path, names), sorted(names)
+    if order == "number" or texts == list(names):
         return cameras, []
-    by_text = dict(zip(texts, _read_rows(path, texts)))
-    by_text = [by_text[name] for name in tracks]
+    rows = dict(zip(texts, read_rows(path, texts)))
+    by_text = [rows[name] for name in names]
     if order == "text":
         return by_text, []
-    images = [_small_image(track) for track in tracks.values()]
-    views = [
-        [camera.resized(*image.shape[1::-1]) for camera, image in zip(all_of, images)]
-        for all_of in (cameras, by_text)
-    ]
-    numbered, as_texts = (photo_error(of, images) for of in views)
-    if not min(numbered, as_texts) < _AGREES * max(numbered, as_texts):  # both may be infinite
-        orders = f"{', '.join([*tracks][:3])} by number, {', '.join(texts[:3])} as texts"
-        got = f"{orders}, and images that do not tell"
-        advice = "set data.camera_order=number or data.camera_order=text"
-        raise mismatch(path, "rows in one order of the cameras", got, advice)
-    which, chosen = ("number", cameras) if numbered < as_texts else ("text", by_text)
-    line = f"rows are taken in the order of the cameras' names by {which}, as neighbouring views agree so"
-    return chosen, [f"{path}: {line}; else set data.camera_order"]
+    small, errors = images(), {}
+    some = spread(len(small), _COMPARED)
+    for by_what, all_of in (("number", cameras), ("text", by_text)):
+        views = [all_of[k].resized(*small[k].shape[1::-1]) for k in some]
+        errors[by_what] = photo_error(views, [small[k] for k in some])
+    if not min(errors.values()) < _AGREES * max(errors.values()):  # both may be infinite
+        orders = f"{', '.join(names[:3])} by number, {', '.join(texts[:3])} as texts"
+        raise mismatch(path, "rows in one order", f"{orders}, and images that do not tell", key)
+    best = min(errors, key=errors.get)
+    line = f"rows are taken in the order of names by {best}, as neighbouring views agree so; else {key}"
+    return cameras if best == "number" else by_text, [f"{path}: {line}"]
 
 
-def _small_image(track: _Track) -> Tensor:
-    """Read the first frame of a camera, a few pixels wide: (H, W, 3) in [0, 1]."""
-    if track.stamps is None:
-        pixels = read_image(track.images[0])[..., :3]
-    else:
-        pixels = torch.from_numpy(next(extracted(track.path, [0], None)))
-    width, height = (max(1, round(side * SIDE / max(track.size))) for side in track.size)
-    planes = pixels.permute(2, 0, 1)[None].float() / 255
+def small_image(pixels: Tensor) -> Tensor:
+    """Make an image uint8 (H, W, C) a few pixels wide: (h, w, 3) in [0, 1]."""
+    height, width = (max(1, round(side * SIDE / max(pixels.shape[:2]))) for side in pixels.shape[:2])
+    planes = pixels[..., :3].permute(2, 0, 1)[None].float() / 255
     return torch.nn.functional.interpolate(planes, (height, width), mode="area")[0].permute(1, 2, 0)
+
+
+def _first_image(track: _Track) -> Tensor:
+    """Read the first frame of a camera, uint8 (H, W, C)."""
+    if track.stamps is None:
+        return read_image(track.images[0])
+    return torch.from_numpy(next(extracted(track.path, [0], None)).copy())
 
 
 def _look(path: Path) -> _Track:

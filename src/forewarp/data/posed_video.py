@@ -25,6 +25,7 @@ from reprlib import repr as short
 import numpy as np
 from torch import Tensor
 
+from forewarp.data import llff
 from forewarp.data.arrays import read_cloud, write_array
 from forewarp.data.cameras import MOST_UNITS, SPLITS, box_of, number_or_none, opengl_rows, space_of
 from forewarp.data.depth import (
@@ -41,6 +42,7 @@ from forewarp.data.directions import check_directions
 from forewarp.data.files import (
     SUFFIXES,
     inside,
+    layout_of,
     mismatch,
     number,
     one_of,
@@ -173,9 +175,14 @@ def read_scene(
     is_metric = depth_kind in (*METRIC, None)
     if not isinstance(depth, (str, Path, type(None))):
         raise mismatch("data.depth", "a folder, off or null", repr(depth))
-    file = scene_folder(root, scene, "nerfstudio") / FILE
-    content = stated(read_json(file))
+    folder, ordered = scene_folder(root, scene, "nerfstudio"), []
+    file = folder / FILE
+    if layout_of(folder) == "LLFF":
+        file, (content, ordered) = folder / llff.FILE, llff.as_transforms(folder)
+    else:
+        content = stated(read_json(file))
     entries, absent, assumed = _read_entries(file, content, scale, axes, inverse, masks)
+    assumed += ordered
     beside = [] if depth in (None, "off") else [file.parent / depth]
     assumed += unread_beside(file, content, [entry.path for entry in entries], beside)
     cut_out = [entry.load for entry in entries if entry.is_cut_out]
