@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from forewarp.data import video
-from forewarp.data.video import extracted, stamps_of
+from forewarp.data.video import extracted, header_of, stamps_of
 from tests.support.films import numbered, write_film
 
 
@@ -47,3 +47,17 @@ def test_frames_that_were_cut_off_without_coding_anew_have_no_time(tmp_path):
     shown = list(extracted(cut, None, None))
     assert len(shown) == 7
     np.testing.assert_array_equal(shown[0], list(extracted(film, [5], None))[0])
+
+
+def test_of_several_streams_the_film_is_taken_not_a_cover_or_a_preview(tmp_path):
+    film = write_film(tmp_path / "film.mp4", numbered(12))
+    small = write_film(tmp_path / "small.mp4", numbered(3, size=(24, 32)))
+    cover = write_film(tmp_path / "cover.mp4", numbered(1, size=(96, 128)))
+    for first in (small, cover):
+        both = tmp_path / f"with_{first.name}"
+        call = [imageio_ffmpeg.get_ffmpeg_exe(), "-y", "-v", "error", "-i", str(first), "-i", str(film)]
+        subprocess.run([*call, "-map", "0:v", "-map", "1:v", "-c", "copy", str(both)], check=True)
+        assert len(stamps_of(both)) == 12
+        frames = [*extracted(both, [0, 11], None)]
+        assert [frame.shape for frame in frames] == [(48, 64, 3)] * 2
+        assert header_of(both).count("Video:") == 1

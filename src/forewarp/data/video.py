@@ -31,6 +31,7 @@ _TAGS = re.compile(r"Video: [^,]*, \w+(?:\(([^)]*)\))?, (\d+)x(\d+)")
 _MATRIX = re.compile(r"\b(?<!/)(bt|smpte|fcc|gbr|ycg|ictcp)")
 _SIDES = re.compile(r"Video: .*[ ,]\d+x\d+[ ,\n]")
 _TOO_LARGE = re.compile(r"Picture size (\d+x\d+) is invalid")
+_STREAM, _SIZE = re.compile(r"^ *Stream #.*: Video:"), re.compile(r", (\d+)x(\d+)")
 _INTERLACED = re.compile(r"Video: .*\b(top|bottom) (coded )?first\b")
 _MOST_TOLD = 2000  # frames that ffmpeg is told to choose; a system takes 128 KiB in a word of a command
 _SD = 1024, 576  # pixels of the longer and the shorter side, at most
@@ -114,22 +115,38 @@ def _is_untagged_hd(video: Path) -> bool:
 
 
 def header_of(video: Path) -> str:
-    """Return what ffmpeg says of a video; kept until the file changes.
+    """Return what ffmpeg says of a video, without covers and previews; kept until the file changes.
 
     Raises:
         OSError: where there is none.
         ValueError: for a pipe or a device, and for frames of more than ``MOST_PIXELS``.
     """
+    return _header_and_stream(video)[0]
+
+
+def _header_and_stream(video: Path) -> tuple[str, str]:
     about = video.stat()
     return _header(video, about.st_size, about.st_mtime_ns)
 
 
 @lru_cache(64)
-def _header(video: Path, size: int, changed: int) -> str:
+def _header(video: Path, size: int, changed: int) -> tuple[str, str]:
+    """Return what ffmpeg says, and its name of the stream that has the most frames and pixels, the film's."""
     told = subprocess.run(ffmpeg_reading(video), capture_output=True).stderr.decode(errors="replace")
     if (large := _TOO_LARGE.search(told)) and not _SIDES.search(told):  # else its frames have another size
         raise mismatch(video, f"frames of at most {MOST_PIXELS} pixels", large[1])
-    return told
+    lines = told.splitlines(keepends=True)
+    streams = [line for line in lines if _STREAM.search(line)]
+    names = [f"0:v:{number}" for number in range(len(streams))] or ["0:v:0"]
+    best = names[0]
+    if streams[1:]:
+        sides = [_SIZE.search(line) for line in streams]
+        pixels = [int(match[1]) * int(match[2]) if match else 0 for match in sides]
+        shown = {name: n * len(_stamps(video, name)) for name, n in zip(names, pixels)}
+        best = max(names, key=shown.get)
+        others = {line for name, line in zip(names, streams) if name != best}
+        told = "".join(line for line in lines if line not in others)
+    return told, best
 
 
 def stamps_of(video: Path) -> np.ndarray:
@@ -137,7 +154,11 @@ def stamps_of(video: Path) -> np.ndarray:
 
     Those before 0 were cut off without coding the rest anew, as phones do, and are not shown.
     """
-    call = [*ffmpeg_reading(video, "-v", "quiet"), "-map", "0:v:0", "-c", "copy", "-f", "framecrc", "-"]
+    return _stamps(video, _header_and_stream(video)[1])
+
+
+def _stamps(video: Path, stream: str) -> np.ndarray:
+    call = [*ffmpeg_reading(video, "-v", "quiet"), "-map", stream, "-c", "copy", "-f", "framecrc", "-"]
     done = subprocess.run(call, capture_output=True)
     lines = done.stdout.decode(errors="replace").splitlines()
     unit = next((Fraction(line.split(":")[1].strip()) for line in lines if line.startswith("#tb 0:")), 1)
@@ -184,7 +205,7 @@ class Log:
 def decode(
     video: Path, filters: str, codec: str, log: Log, threads: int | None, start: float | None = None
 ) -> Iterator[np.ndarray]:
-    """Decode the first video stream into images, grey (pgm) or colour (ppm).
+    """Decode the film's stream, see ``header_of``, into images, grey (pgm) or colour (ppm).
 
     Args:
         video: any that ffmpeg reads.
@@ -194,7 +215,8 @@ def decode(
         threads, start: see ``extracted``.
     """
     limit = ["-threads", str(threads or 0)]  # of decoder and encoder
-    shape = ["-map", "0:v:0", "-vf", filters, "-filter_threads", limit[1], "-fps_mode", "passthrough"]
+    stream = _header_and_stream(video)[1]
+    shape = ["-map", stream, "-vf", filters, "-filter_threads", limit[1], "-fps_mode", "passthrough"]
     seek = [] if start is None else ["-ss", f"{start:.6f}"]
     call = [*ffmpeg_reading(video, "-nostats", *limit, *seek), *shape, *limit]
     call += ["-f", "image2pipe", "-c:v", codec, "-"]
