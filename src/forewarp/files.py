@@ -8,6 +8,7 @@ import glob
 import io
 import json
 import os
+import re
 import secrets
 import shutil
 import stat
@@ -37,6 +38,14 @@ _LEFT = 24 * 3600  # seconds after which nobody fills a folder any more
 _PLAIN_TAGS = {f"tag:yaml.org,2002:{kind}" for kind in ("str", "int", "float", "bool", "null", "map", "seq")}
 _PLAIN_TAGS |= {None, "!"}
 _DIGITS = 4300  # of a number; those of sixty parts take time that grows by the square
+
+
+def disk_error(said: str, path: Path) -> OSError:
+    """Return the error of a ``path`` that another program could not write, by what it ``said``."""
+    if re.search("no space left|quota exceeded|too large", said, re.IGNORECASE):
+        return OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
+    got = short(" ".join(said.split()[:40])) if said.strip() else "it ended early (is the disk full?)"
+    return OSError(errno.EIO, got, str(path))
 
 
 @contextmanager

@@ -1,9 +1,13 @@
+import errno
+import resource
+
 import imageio.v3 as iio
 import pytest
 import torch
 
 from forewarp.drawing import images
 from forewarp.drawing.images import write_png, write_video
+from forewarp.files import disk_error
 from tests.support.films import read_film
 
 RED = torch.tensor([[1.0, 0.0, 0.0]])
@@ -122,3 +126,29 @@ def test_nothing_half_written_stays(tmp_path, suffix):
     with pytest.raises(ValueError, match=r"expected images of \(20, 30, 3\), .* but got \(20, 32, 3\)"):
         write_video(tmp_path / "a.mp4", [torch.zeros(20, width, 3) for width in (30, 32)], fps=10)
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.fixture
+def room():
+    """``room(size)`` is the most bytes that a file may have from then on, as on a disk that is full."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    yield lambda size: resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+    resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+@pytest.mark.parametrize("name", ["a.mp4", "a.gif", "a.png"])
+def test_a_full_disk_is_an_error_and_keeps_the_film_that_was_there(tmp_path, room, name):
+    noise = [torch.rand(64, 64, 3, generator=torch.Generator().manual_seed(0)) for _ in range(4)]
+    (tmp_path / name).write_text("good")
+    write = write_png if name == "a.png" else write_video
+    room(4096)
+    with pytest.raises(OSError, match="ended early|too large") as refused:
+        write(tmp_path / name, noise[0]) if name == "a.png" else write(tmp_path / name, noise, fps=5)
+    assert refused.value.filename == str(tmp_path / name)
+    assert [path.read_text() for path in tmp_path.iterdir()] == ["good"]
+
+
+def test_what_another_program_says_of_a_full_disk_is_understood(tmp_path):
+    error = disk_error("av_interleaved_write_frame(): No space left on device\n", tmp_path / "a.mp4")
+    assert (error.errno, error.filename) == (errno.ENOSPC, str(tmp_path / "a.mp4"))
+    assert "Unknown encoder" in disk_error("Unknown encoder", tmp_path).strerror

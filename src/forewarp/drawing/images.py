@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import math
+import os
 import subprocess
 import tempfile
 from collections.abc import Iterable
@@ -16,7 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from forewarp.files import written_whole
+from forewarp.files import disk_error, replace_file, written_whole
 from forewarp.media import ffmpeg_reading, film_bytes, read_rgb
 
 # Far to near, steadily lighter, so that it also works in grey.
@@ -227,6 +228,7 @@ def hidden(at: Tensor, distance: Tensor, depth: Tensor, slack: float) -> Tensor:
 
 
 FORMATS = ("mp4", "gif", "png")
+_CRF = "10"  # loss of films, as ffmpeg's crf
 _SMALLER = ((1, 20), (1, 26), (1, 32), (2, 26), (2, 32), (4, 32))  # size to divide by, loss (ffmpeg's crf)
 
 
@@ -237,8 +239,7 @@ def to_bytes(image: Tensor) -> np.ndarray:
 
 def write_png(path: Path, image: Tensor) -> Path:
     """Write (H, W, 3) in [0, 1]; make the folder."""
-    with written_whole(path) as beside:
-        iio.imwrite(beside, to_bytes(image), extension=".png")
+    replace_file(path, png_bytes(image))
     return path
 
 
@@ -274,17 +275,18 @@ def video_within(path: Path, most: int) -> tuple[bytes, str]:
     """
     if len(content := film_bytes(path)) <= most:
         return content, ""
-    with tempfile.TemporaryDirectory(prefix="forewarp-") as folder:
-        file = Path(folder) / "video.mp4"
-        for shrink, loss in _SMALLER:
+    for shrink, loss in _SMALLER:
+        with tempfile.TemporaryFile() as file:  # without a name, so that a killed process leaves none
             even = f"scale=trunc(iw/{2 * shrink})*2:trunc(ih/{2 * shrink})*2:flags=area"
             options = f"-vf {even} -crf {loss} -pix_fmt yuv420p -movflags +faststart -an".split()
-            call = ffmpeg_reading(path, "-y", "-v", "error")
-            if subprocess.run([*call, *options, str(file)], capture_output=True).returncode:
+            call = [*ffmpeg_reading(path, "-y", "-v", "error"), *options]
+            call += ["-f", "mp4", f"/dev/fd/{file.fileno()}"]
+            if subprocess.run(call, capture_output=True, pass_fds=[file.fileno()]).returncode:
                 raise OSError(errno.EIO, "ffmpeg could not read it", str(path))
-            if file.stat().st_size <= most:
+            if file.seek(0, os.SEEK_END) <= most:
+                file.seek(0)
                 size = f", at 1/{shrink} of its width and height" if shrink > 1 else ""
-                return file.read_bytes(), f"encoded again with more loss{size}"
+                return file.read(), f"encoded again with more loss{size}"
     return b"", "left out"
 
 
@@ -296,6 +298,9 @@ def write_video(path: Path, images: Iterable[Tensor], *, fps: float, sound: Path
 
     Returns:
         the file or the folder.
+
+    Raises:
+        OSError: naming ``path``, where it cannot be written whole; what was there then stays.
     """
     if path.suffix == ".png":
         folder, count = path.with_suffix(""), 0
@@ -304,11 +309,12 @@ def write_video(path: Path, images: Iterable[Tensor], *, fps: float, sound: Path
         keep_first(folder, count)
         return folder
     frames = map(to_bytes, images)
+    if path.suffix == ".gif":
+        options = {"extension": ".gif", "duration": 1000 / fps, "loop": 0}
+        replace_file(path, iio.imwrite("<bytes>", list(frames), **options))
+        return path
     with written_whole(path) as beside:
-        if path.suffix == ".gif":
-            iio.imwrite(beside, list(frames), extension=".gif", duration=1000 / fps, loop=0)
-        else:
-            _write_mp4(beside, frames, fps, sound)
+        _write_mp4(beside, frames, fps, sound)
     return path
 
 
@@ -323,20 +329,26 @@ def _write_mp4(path: Path, frames: Iterable[np.ndarray], fps: float, sound: Path
     # The codec takes even sides only.
     frames = (np.pad(f, ((0, f.shape[0] % 2), (0, f.shape[1] % 2), (0, 0)), mode="edge") for f in frames)
     first = next(frames)
-    # The default block of 16 would stretch the image; 2 is the smallest that the codec allows.
-    options = {"fps": fps, "quality": 8, "macro_block_size": 2, "ffmpeg_log_level": "error"}
-    options["output_params"] = ["-colorspace", "smpte170m"]  # as ffmpeg converts; else HD shows as BT.709
-    if sound is not None:
-        options |= {"audio_path": str(sound), "audio_codec": "aac"}
-    writer = imageio_ffmpeg.write_frames(str(path), first.shape[1::-1], **options)
-    writer.send(None)
-    try:
-        for frame in chain([first], frames):
-            if frame.shape != first.shape:  # ffmpeg would take it, and shear all that follow
-                expected = f"images of {first.shape}, as the first"
-                raise ValueError(f"video: expected {expected}, but got {frame.shape}")
-            writer.send(np.ascontiguousarray(frame))
-    except OSError as error:  # its message has many lines and does not name the file
-        raise OSError(errno.EIO, "ffmpeg could not go on (is the disk full?)", str(path)) from error
-    finally:
-        writer.close()
+    height, width, _ = first.shape
+    call = [imageio_ffmpeg.get_ffmpeg_exe(), "-y", "-v", "error", "-f", "rawvideo", "-pix_fmt", "rgb24"]
+    call += ["-s", f"{width}x{height}", "-r", str(fps), "-i", "-"]
+    call += ["-an"] if sound is None else ["-i", str(sound), "-map", "0:v:0", "-map", "1:a:0", "-c:a", "aac"]
+    call += ["-c:v", "libx264", "-crf", _CRF, "-pix_fmt", "yuv420p"]
+    call += ["-colorspace", "smpte170m", str(path)]  # as ffmpeg converts; else HD shows as BT.709
+    with tempfile.TemporaryFile() as said:  # no pipe, which would fill up
+        with subprocess.Popen(call, stdin=subprocess.PIPE, stderr=said) as process:
+            try:
+                for frame in chain([first], frames):
+                    if frame.shape != first.shape:  # ffmpeg would take it, and shear all that follow
+                        expected = f"images of {first.shape}, as the first"
+                        raise ValueError(f"video: expected {expected}, but got {frame.shape}")
+                    process.stdin.write(np.ascontiguousarray(frame))
+                process.stdin.close()
+            except BrokenPipeError:  # it has ended, and says why
+                process.stdin.raw.close()
+            except BaseException:
+                process.kill()
+                raise
+        if process.returncode:
+            said.seek(0)
+            raise disk_error(said.read().decode(errors="replace"), path)

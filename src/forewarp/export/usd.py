@@ -12,6 +12,7 @@ from torch import Tensor
 
 from forewarp.export.ply import ALONG
 from forewarp.export.tracks import Progress, Source
+from forewarp.files import disk_error
 from forewarp.scene.camera import mean_up
 from forewarp.scene.cloud import Ellipsoids
 
@@ -39,8 +40,9 @@ def export_usd(
 
     Raises:
         ValueError: for a method without particles, for another axis, or an OpenUSD that knows no Gaussians.
+        OSError: where the file cannot be written whole.
     """
-    from pxr import Gf, Usd, UsdGeom, UsdVol, Vt
+    from pxr import Gf, Tf, Usd, UsdGeom, UsdVol, Vt
 
     if not source.has_ellipsoids:
         raise source.without_particles("usd")
@@ -59,7 +61,8 @@ def export_usd(
         cloud["orientations"] = np.where(flips, -1, 1).astype(np.float32) * cloud["orientations"]
     codes = [time * seconds * _FPS for time in source.times]
 
-    stage = Usd.Stage.CreateNew(str(folder / "scene.usdc"))
+    file = folder / "scene.usdc"
+    stage = Usd.Stage.CreateNew(str(file))
     UsdGeom.SetStageUpAxis(stage, axis.upper())
     UsdGeom.SetStageMetersPerUnit(stage, 1.0)
     stage.SetTimeCodesPerSecond(_FPS)
@@ -90,7 +93,10 @@ def export_usd(
             sampled.append(name)
             for code, value in zip(codes, values):
                 attribute.Set(value, code)
-    stage.Save()
+    try:
+        stage.Save()
+    except Tf.ErrorException as error:
+        raise disk_error(str(error), file) from error
     facts = {"particles": len(clouds[0]["positions"]), "degree": degree, "degree of the run": own_degree}
     facts |= {"seconds": seconds, "sampled": sampled, "off between times": off_between(source)}
     turned = "" if rotation is None else ", turned from the data's world"
