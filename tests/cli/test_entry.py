@@ -285,6 +285,15 @@ def test_one_line(error, line):
     assert one_line(error).startswith(line)
 
 
+def test_a_killed_command_leaves_no_temporary_folder(ok, monkeypatch, in_tmp):
+    """Whatever there is while a job runs would stay where the process is killed."""
+    there = []
+    monkeypatch.setattr("tempfile.tempdir", str(in_tmp))
+    monkeypatch.setattr("forewarp.cli.train.train", lambda config: there.extend(in_tmp.iterdir()))
+    ok("train")
+    assert there == list(in_tmp.iterdir()) == []
+
+
 @pytest.mark.slow
 def test_a_failed_job_of_several_does_not_stop_the_others(forewarp, monkeypatch, in_tmp):
     seen = []

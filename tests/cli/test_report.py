@@ -13,6 +13,16 @@ def test_pages_are_written_and_named(ok, in_tmp):
         assert (in_tmp / "out" / page).read_text().startswith("# ")
 
 
+@pytest.mark.parametrize("typed", ["runs [1]", "runs [1]/*", "[runs [1]/a[b],runs [1]/c]", "runs [1]/a[b]"])
+def test_names_of_folders_may_have_brackets(ok, in_tmp, typed):
+    for name, scene in (("a[b]", "one"), ("ab", "two"), ("c", "three")):  # as a pattern a[b] is ab
+        write_run(f"runs [1]/{name}", scene=scene)
+    ok("report", "kind=table", f"runs={typed}", "rows=scene", "out=out")
+    rows = (in_tmp / "out" / "table.csv").read_text().splitlines()[1:]
+    wanted = {"runs [1]/a[b]": {"one"}, "[runs [1]/a[b],runs [1]/c]": {"one", "three"}}
+    assert {row.split(",")[0] for row in rows} == wanted.get(typed, {"one", "two", "three"})
+
+
 def test_the_help_has_a_line_for_each_kind(forewarp):
     text = forewarp("report", "--help").out
     for kind in KINDS.split(", "):

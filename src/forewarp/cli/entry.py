@@ -7,6 +7,7 @@ import json
 import logging
 import os
 import re
+import secrets
 import signal
 import sys
 import tempfile
@@ -174,24 +175,29 @@ def _run(name: str, task: Callable, conf: Path, config_name: str) -> list[int]:
         score = result if isinstance(result, int | float) else None
         found = [None, None] if status else [str(config.get("run")), config.get("score")]
         row = [status, command_of_job(name), *found, score]
+        if os.getpid() == launched_by:
+            jobs.append(row)
+            return result
         with suppress(OSError), open(ended, "a") as file:
             file.write(json.dumps(row) + "\n")
         return result
 
-    # In a file, as jobs may be other processes; those of other machines do not reach it.
-    with tempfile.TemporaryDirectory(prefix="forewarp-") as folder:
-        ended = Path(folder) / "ended"
-        ended.touch()
-        try:
-            hydra.main(version_base="1.3", config_path=str(conf), config_name=config_name)(job)()
-        except PlanOnly as ended_by:
-            if (error := ended_by.error) is not None:  # no job began, so none says what is wrong
-                error = error if one_line(error) else ValueError(f"{type(error).__name__}: {error}")
-                return [_tell(name, error, config_name)]
-        finally:  # a sweeper may fail, too
-            jobs = [json.loads(line) for line in ended.read_text().splitlines()]
-            if len(jobs) > 1:
-                _tell_jobs(name, jobs)
+    # Jobs of other processes tell in a file, which they make, so that a killed command leaves none; those of
+    # other machines do not reach it.
+    jobs, launched_by = [], os.getpid()
+    ended = Path(tempfile.gettempdir()) / f"forewarp-{secrets.token_hex(16)}"
+    try:
+        hydra.main(version_base="1.3", config_path=str(conf), config_name=config_name)(job)()
+    except PlanOnly as ended_by:
+        if (error := ended_by.error) is not None:  # no job began, so none says what is wrong
+            error = error if one_line(error) else ValueError(f"{type(error).__name__}: {error}")
+            return [_tell(name, error, config_name)]
+    finally:  # a sweeper may fail, too
+        with suppress(FileNotFoundError):
+            jobs += [json.loads(line) for line in ended.read_text().splitlines()]
+            ended.unlink()
+        if len(jobs) > 1:
+            _tell_jobs(name, jobs)
     return [status for status, *_ in jobs]
 
 

@@ -117,8 +117,11 @@ def listed(names: object) -> list[str]:
 
 
 def expanded(name: str, needed: str) -> list[str]:
-    """List the folders that a pattern means and that hold ``needed``; without any, all, which are refused."""
-    folders = sorted(glob(name))
+    """List the folders that a pattern means and that hold ``needed``; without any, all, which are refused.
+
+    Brackets are those of a folder's name where there is such a folder, or where as a pattern they mean none.
+    """
+    folders = [name] if Path(name).is_dir() else sorted(glob(name)) or sorted(glob(name.replace("[", "[[]")))
     return [folder for folder in folders if any(Path(folder).glob(needed))] or folders or [name]
 
 

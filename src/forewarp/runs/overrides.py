@@ -82,6 +82,8 @@ def as_text(arguments: Sequence[str]) -> list[str]:
     ["data.root='/data/josé'", "data.scene='hand (1)'", 'out=null', "run='a b'", 'seed=1']
     >>> as_text(["data.scene=null", "data.scene={a}", "run=[a]", "runs=[a]"])
     ["data.scene='null'", "data.scene='{a}'", "run='[a]'", 'runs=[a]']
+    >>> as_text(["runs=[my [old] runs,b]", "runs=[1] old"])
+    ["runs=['my [old] runs',b]", "runs='[1] old'"]
     >>> as_text([r"data.name_pattern=(?P<frame>\d+)", "name_pattern=_(?P<frame>[0-9]+)$"])
     ["data.name_pattern='(?P<frame>\\d+)'", "name_pattern='_(?P<frame>[0-9]+)$'"]
     """
@@ -94,14 +96,22 @@ def as_text(arguments: Sequence[str]) -> list[str]:
         several = typed and not is_pattern and (swept or name == "data.scene") and is_sweep(argument)
         if typed and name != "data.scene" and value.startswith("~/"):
             value = os.path.expanduser(value)
+        if name in LISTS and _is_list(value) and parsed(argument) is None:  # names with brackets
+            parts = (text_override("", part.strip()).removeprefix("=") for part in value[1:-1].split(","))
+            argument = f"{key}=[{','.join(parts)}]"
         found.append(text_override(key, value) if typed and not several else argument)
     return found
+
+
+def _is_list(value: str) -> bool:
+    """Tell whether a path or name was typed as a list of them; a folder may be called ``[1]``."""
+    return value[:1] == "[" and value[-1:] == "]" and not os.path.isdir(value)
 
 
 def _is_of_hydra(key: str, value: str) -> bool:
     """Tell whether a path or name was typed as Hydra's grammar has it."""
     is_quoted = len(value) > 1 and value[0] == value[-1] and value[0] in "'\""
-    is_null, is_list = value == "null" and key != "data.scene", value[0] == "[" and key in LISTS
+    is_null, is_list = value == "null" and key != "data.scene", key in LISTS and _is_list(value)
     return is_quoted or is_null or is_list or value.startswith("${")
 
 
