@@ -56,6 +56,11 @@ def test_two_seeds_show_both_values_and_no_mark(tmp_path):
     assert rows_of(text, "0") == [["0", "29.50 (29.00, 30.00)"]]
 
 
+def test_seeds_are_rows_where_asked_for(tmp_path):
+    text = table(multirun(tmp_path / "runs"), tmp_path, rows=["rigid", "seed"])
+    assert rows_of(text, "1") == [["1", "0", "30.00"], ["1", "1", "32.00"]]
+
+
 def test_what_differs_within_a_cell_is_refused_with_the_key_to_add(tmp_path):
     runs = multirun(tmp_path / "runs")
     told = r"got in forward, ball rigid=0 and rigid=1; add objective.fine.weights.rigid to rows= or columns="

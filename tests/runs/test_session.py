@@ -77,10 +77,11 @@ def test_a_file_system_without_locks_is_used_without(tmp_path, monkeypatch):
 
 def test_a_folder_is_claimed_for_one_config(tmp_path):
     def claimed(finished=False, **changes):
-        config = {name: {"name": name} for name in ("model", "objective", "stage", "preset")}
+        config = {name: {"name": name} for name in ("model", "preset")} | {"objective": {}}
+        config |= {"stage": {"fine": {"share": 1}}}
         config |= {"run": str(tmp_path), "data": {"root": str(tmp_path)}, "budget": {"minutes": 1}, "seed": 0}
-        config |= {"resume": None, "trust": ["theirs"], "viewer": True, "logger": None, "callbacks": None}
-        claim(OmegaConf.create(config | {"trainer": None} | changes), finished=finished)
+        config |= {"resume": None, "trust": ["theirs"], "viewer": True, "logger": None, "callbacks": {}}
+        claim(OmegaConf.create(config | {"trainer": {"accelerator": "auto"}} | changes), finished=finished)
         return OmegaConf.load(tmp_path / "config.yaml")
 
     claimed(seed=5)
@@ -89,13 +90,13 @@ def test_a_folder_is_claimed_for_one_config(tmp_path):
     (tmp_path / "coarse").mkdir()
     (tmp_path / "coarse" / "last.ckpt").touch()
     claimed(finished=True, data={"root": str(tmp_path), "disk_cache_bytes": 1})  # changes no frame
-    assert claimed(finished=True, trainer="cpu") == stored
-    assert claimed(trainer="cpu").trainer == "cpu"
+    assert claimed(finished=True, trainer={"accelerator": "cpu"}) == stored
+    assert claimed(trainer={"accelerator": "cpu"}).trainer.accelerator == "cpu"
     for changes, says in (
         ({"seed": 1}, "seed: expected 0, as the run that this folder holds, but got 1; use run="),
         ({"seed": 1, "budget": {"minutes": 9}}, "seed: expected 0, .* but got 1 .and 1 more keys.; use run="),
         ({"seed": 1, "model": {"name": "nerf"}}, "model.name: expected model, .* but got nerf .and 1 more"),
-        ({"stage": {}}, "stage.name: expected stage, .* but got nothing"),
+        ({"stage": {}}, "stage.fine: expected .*, as the run .* but got nothing"),
     ):
         with pytest.raises(ValueError, match=f"config.yaml: {says}"):
             claimed(**changes)

@@ -21,8 +21,8 @@ What one types most:
   runs=FOLDER            searched for runs (runs/accuracy_time, minutes, effects, search, ..., else paper)
   runs=FILE.csv          a page's own table: write it anew (ablation, effects, methods, minutes, price_list)
   runs=[FOLDER,FOLDER]   compare: the runs themselves; table: folders to search; patterns with * are expanded
-  rows=NAMES columns=NAMES   table: model, preset, scene, dataset, minutes, variant, or a key of config.yaml
-                         or its last parts (rows=model,rigid); a cell is a mean over seeds and of nothing else
+  rows=NAMES columns=NAMES   table: model, preset, scene, dataset, minutes, seed, variant, a key of
+                         config.yaml or its last parts (rows=model,rigid); a cell is a mean over seeds alone
   metric=NAMES           table: psnr,lpips,space/psnr, your own; costs: train, step, frame, memory, bytes, ...
   pareto=true            table: draw the first metric against seconds, memory and bytes
   out=FOLDER             where the page goes (results/ below the runs); compare: where the picture goes
@@ -37,7 +37,7 @@ What one types most:
   trainer=cpu|gpu|auto   run: device to compute with; without it the one of the run
   trust=[PACKAGE]        run: code of other packages that a run's config may name
 
-The runs: make accuracy-time [DATA=DATASETS SCENE=NAME MINUTES=N], make price-list DATA=DATASETS,
+The runs: make accuracy-time [DATA=DATASETS SCENES=NAME MINUTES=N], make price-list DATA=DATASETS,
 make reproduce-tables [DATA=DATASETS], make ablations, make effects. Runs without results are listed.
 """
 

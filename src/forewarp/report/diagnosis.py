@@ -87,8 +87,10 @@ class Diagnosis:
 
     @property
     def nothing(self) -> str:
-        """Say what was looked for in vain."""
-        return f"nothing stands out; no part of the error that was looked at would bring {LEAST} dB."
+        """Say what was looked for in vain, and what was not looked at."""
+        text = f"nothing stands out; no part of the error that was looked at would bring {LEAST} dB."
+        skipped = ["pixels of test views"] * (not self.views) + ["training images"] * ("psnr" not in self.fit)
+        return text + (f" Not looked at: {', '.join(skipped)} (render=false)." if skipped else "")
 
     def data(self) -> dict:
         """Return all of it as JSON holds it."""
@@ -329,7 +331,7 @@ def _of_fit(
         rose = f"PSNR rose by {rise:.1f} dB in the last third of the training; " if rise is not None else ""
         text = f"Short training: {steps:.3g} steps for each training image; {rose}"
         times = "four times" if steps < _FEW_STEPS else "twice"
-        text += f"judged by runs of this project, {times} the time brings at most about {gain:.1f} dB."
+        text += f"judged by other runs of this project, {times} the time may bring {gain:.1f} dB."
         causes.append(("training", text, 1 - 10 ** (-gain / 10)))
     if not {"psnr", "images"} <= fit.keys():
         return causes
@@ -346,7 +348,8 @@ def _of_fit(
         )
         causes.append(("far", f"{text}; {reached} them.", share))
     elif lacks > 0:
-        causes.append(("overfit", f"Overfitting: the {fit['images']:.0f} {reached} test views.", share))
+        text = f"Gap between training and test views: the {fit['images']:.0f} {reached} test views."
+        causes.append(("overfit", text, share))
     return causes
 
 
@@ -393,16 +396,16 @@ def more_steps(steps: float, rise: float | None) -> float:
     Up to 1,000 steps for each training image the bound, 0.5 dB and 40 dB over the steps, at most 5 dB, lies
     above nearly all of what doubling the time brought to this project's runs of eleven methods on nine scenes
     (docs/results). Beyond, where few runs are, its 0.5 dB are taken to fall as steps grow. The rise within a
-    run is no measure of it, as learning rates fall at the end of any run: but where the curve is flat, twice
-    the time brings no more than the rise.
+    run is no measure of it, as learning rates fall at the end of any run: twice the time brought up to 1.8
+    times the rise of the last third. Where the curve is flat it is taken to bring no more than twice that.
 
     >>> [round(more_steps(steps, None), 3) for steps in (5, 100, 1000, 130_000)], more_steps(100, 0.1)
-    ([9.5, 0.9, 0.54, 0.004], 0.1)
+    ([9.5, 0.9, 0.54, 0.004], 0.2)
     """
     doubled = _doubled(steps)
     if steps < _FEW_STEPS:
         return doubled + _doubled(2 * steps)
-    return doubled if rise is None else min(doubled, max(rise, 0.0))
+    return doubled if rise is None else min(doubled, 2 * max(rise, 0.0))
 
 
 def _doubled(steps: float) -> float:

@@ -19,7 +19,7 @@ from forewarp.report.tables import Column, Table, rendered
 
 # What rows and columns may be of, beside keys of config.yaml: name -> column of a row of ``results``.
 FIELDS = {"model": "method", "method": "method", "preset": "preset", "scene": "scene", "dataset": "dataset"}
-FIELDS |= {"minutes": "minutes", "variant": "variant", "ablation": "ablation"}
+FIELDS |= {"minutes": "minutes", "variant": "variant", "ablation": "ablation", "seed": "seed"}
 FIELDS |= {name: name for name in CONDITIONS}
 # What runs of a cell share, in the order in which a difference is told.
 SHARED = ("scene", "dataset", "method", "preset", "ablation", "minutes", *CONDITIONS, "setting")
@@ -255,13 +255,16 @@ def caption(runs: Runs, cells: Mapping) -> str:
     parts = {"budget": _budget(runs), "presets": ", ".join(sorted({row["preset"] for row in runs}))}
     parts |= {"machine": runs.machines(), "days": runs.days()}
     measured = dict.fromkeys(filter(None, (row["measured"] for row in runs)))
-    kinds = dict.fromkeys("all" if row["ability"] == "all" else f"of {row['ability']}" for row in runs)
+    kinds = dict.fromkeys(row["ability"] for row in runs)
     parts |= {"test views": "; ".join([*measured] or [*kinds])}
     if [*kinds] != ["all"]:
-        parts["scores"] = f"of the kind of test view {', '.join(kind.removeprefix('of ') for kind in kinds)}"
+        others = sorted({kind for row in runs for kind in row["test"]} - {*kinds})
+        parts["scores"] = f"means over the test views of kind {', '.join(kinds)}"
+        parts["scores"] += f" (metric={others[0]}/psnr: those of kind {others[0]})" if others else ""
     parts |= {"images": "; ".join(dict.fromkeys(filter(None, (row["pictures"] for row in runs))))}
     conditions = "; ".join(f"{name}: {text}" for name, text in parts.items() if text)
-    marked = "" if max(counts) < 3 else " The best and the second of a column are marked; ties share a mark."
+    marks = " The best of a column is bold, the second underlined; ties share a mark."
+    marked = marks if max(counts) >= 3 else ""
     return f"{first}. {conditions[:1].upper()}{conditions[1:]}.{marked}"
 
 

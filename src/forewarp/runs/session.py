@@ -26,7 +26,7 @@ from forewarp.runs.config import (
     read_config,
     set_value,
 )
-from forewarp.runs.overrides import command_line, typed_folders, typed_overrides
+from forewarp.runs.overrides import command_of_job
 from forewarp.training.stages import Run
 
 PACKAGES = "packages.txt"  # all that was installed when the run was last trained
@@ -115,9 +115,7 @@ def claim(config: DictConfig, *, finished: bool = False) -> None:
     path = Path(config.run) / "config.yaml"
     make_absolute(config)
     if config.get("resume") is None:
-        is_typed = HydraConfig.initialized()
-        words = [*typed_folders(), *typed_overrides()] if is_typed else []
-        config.command = command_line("train", words) if is_typed else None
+        config.command = command_of_job("train") if HydraConfig.initialized() else None
     config.resume = None
     if "trust" in config:  # only who runs the command may trust, never a folder
         config.trust = None
