@@ -1,5 +1,6 @@
 .DEFAULT_GOAL := help
 .PHONY: help install install-launchers install-trackers install-browser constraints demo demo-lego-complete demo-hypernerf demo-nhr test test-slow \
+	test-floors fuzz \
 	conformance test-stability bench bench-gpu effects accuracy-time price-list reproduce-tables ablations docs docs-serve \
 	lint format clean
 SHELL := bash
@@ -53,6 +54,15 @@ test-slow: ## run the slow tests: the page in a browser, killed runs, every meth
 	$(BIN)/pytest --no-cov -m slow
 test-stability: ## run the numerical hard cases and killed runs, slow ones too
 	$(BIN)/pytest --no-cov -m stability tests/stability
+FLOORS := .venv-floors
+test-floors: ## run the same tests with the lowest versions that pyproject.toml admits, in .venv-floors
+	test -x $(FLOORS)/bin/python || $(PYTHON) -m venv $(FLOORS)
+	$(FLOORS)/bin/pip install --quiet uv
+	$(LINKS); VIRTUAL_ENV="$$PWD/$(FLOORS)" $(FLOORS)/bin/uv pip install --resolution lowest-direct \
+		-e '.[cpu,synth,plots,viewer,export,usd,capture,dev]'
+	$(FLOORS)/bin/pytest --no-cov -W default -m "not slow" # they warn of what came later
+fuzz: ## read 5,000 harmed files of every format, the same each time: none may take 10 s, a gigabyte, or a traceback
+	OMP_NUM_THREADS=1 $(BIN)/pytest --no-cov -q -s tests/stability/test_fuzzing.py --hypothesis-profile=fuzz
 conformance: ## test every method against the contract, slow cases too, and write docs/conformance.md
 	OMP_NUM_THREADS=1 $(BIN)/pytest --no-cov -q tests/contract/test_contract.py --conformance=docs/conformance.md
 bench: ## time every operator, a step and a frame, into docs/performance.md (a quarter of an hour)
