@@ -163,7 +163,7 @@ class _Scan:
         size = width * height * np.dtype(kind).itemsize
         try:
             raw = lzfse.decompress(self.member(name, size + _OVERHEAD))
-        except lzfse.error as error:
+        except (lzfse.error, MemoryError) as error:  # of lengths that a harmed stream claims
             raise mismatch(where, "data compressed by LZFSE", "others") from error
         if len(raw) != size:
             raise mismatch(where, f"{width} x {height} numbers as dw and dh say", f"{len(raw)} bytes")
