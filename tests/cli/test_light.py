@@ -23,7 +23,18 @@ for name, *words in json.load(sys.stdin):
     GlobalHydra.instance().clear()
     print(json.dumps([status, err.getvalue(), sorted(sys.modules)]), flush=True)
 """
-COMMANDS = ("train", "plan", "evaluate", "render", "view", "export", "report", "synthesize", "capture")
+COMMANDS = (
+    "train",
+    "plan",
+    "evaluate",
+    "render",
+    "view",
+    "export",
+    "report",
+    "synthesize",
+    "capture",
+    "data",
+)
 NOWHERE = ["data=dnerf", "data.root=nowhere", "data.scene=x"]
 REFUSED = [
     (["train", "data.scence=x"], "did you mean data.scene?"),
@@ -51,6 +62,11 @@ REFUSED = [
     (["report", "kind=run", "run=a"], "config.yaml: expected the configuration of a run, but got none"),
     (["report"], "runs/accuracy_time: expected folders of runs, but got none"),
     (["capture"], "expected video=FILE, videos=FOLDER or images=FOLDER, but got none"),
+    (["data", "check"], "expected check SCENES, but got check"),
+    (
+        ["data", "check", "nowhere"],
+        "nowhere: expected the folder that holds dnerf/hook and so on, but got none",
+    ),
     (["synthesize", "folder=."], "expected a new or empty folder, but got one with files"),
 ]
 
