@@ -265,6 +265,10 @@ def test_points_far_from_the_origin_are_as_exact_as_the_cameras(tmp_path):
         scenes.append(read_scene(tmp_path, name))
     for scene in scenes[1:]:
         torch.testing.assert_close(scene.still, scenes[0].still, atol=1e-6, rtol=0)
+    with refused(
+        r"within 1.2e\+06 units of the origin .* but got 4.672e\+06, too far .* data.normalise=true"
+    ):
+        read_scene(tmp_path, "far", normalise=False)
     there = scenes[-1].world
     torch.testing.assert_close(
         there.to_data(scenes[-1].still), torch.from_numpy(points + shift), atol=1e-4, rtol=0

@@ -32,6 +32,7 @@ _SAME_PIXEL = 0.01
 _NEAR, _FAR = 0.2, 2.5
 _LEAST, _MOST = 1e-3, 50.0  # a focus outside these shares of the assumed distance is not trusted
 _SAME_PLACE = 1e-9
+_FAR_AWAY = 1e4  # far planes from the origin: there single precision moves things by about a pixel
 _AHEAD = 4.0  # assumed distance of what is looked at, in radii of the cameras' places
 # Poses are stored with six digits or more; a scale or a shear in a pose is never this small.
 _ROTATION_TOLERANCE = 1e-3
@@ -199,6 +200,10 @@ def space_of(
     """
     focus, distances = _focus(cameras, near, far, where)
     near, far = _range(distances, near, far, where)
+    if not normalise and float(focus.norm()) > _FAR_AWAY * far:
+        expected = f"cameras within {_FAR_AWAY * far:.3g} units of the origin with data.normalise=false"
+        advice = "set data.normalise=true (exports are in the file's world), or move the origin"
+        raise mismatch(where, expected, f"{float(focus.norm()):.4g}, too far for single precision", advice)
     size = max(float((camera.center - focus).norm()) for camera in cameras) / radius if normalise else 1.0
     center = tuple(focus.tolist()) if normalise else (0.0, 0.0, 0.0)
     space = Normalisation(center, 1 / size, near / size, far / size)
