@@ -49,6 +49,19 @@ def test_an_error_names_the_file_that_it_is_of(tmp_path):
     assert caught.value.filename == str(tmp_path / "other")
 
 
+def test_a_folder_that_does_not_fit_names_the_file_that_would_have_been(tmp_path):
+    with (
+        pytest.raises(OSError, match="No space left") as caught,
+        folder_written_whole(tmp_path / "out", "m") as part,
+    ):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(part / "a" / "b"))
+    assert caught.value.filename == str(tmp_path / "out" / "a" / "b")
+    with pytest.raises(FileNotFoundError) as caught, folder_written_whole(tmp_path / "out", "m"):
+        (tmp_path / "other").read_text()
+    assert caught.value.filename == str(tmp_path / "other")
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_numbers_that_json_has_not_are_refused(tmp_path):
     with pytest.raises(ValueError, match="nan"):
         write_json(tmp_path / "a.json", {"a": float("nan")})

@@ -34,6 +34,7 @@ MOST_FILM = MOST_ARCHIVE = 1 << 40
 MOST_ARRAYS = 1 << 30  # of NumPy's files, also when unpacked
 MOST_LEVELS = 40  # of YAML, one within the other
 
+_FULL = errno.ENOSPC, errno.EDQUOT, errno.EFBIG  # what a full disk says
 _LEFT = 24 * 3600  # seconds after which nobody fills a folder any more
 _PLAIN_TAGS = {f"tag:yaml.org,2002:{kind}" for kind in ("str", "int", "float", "bool", "null", "map", "seq")}
 _PLAIN_TAGS |= {None, "!"}
@@ -72,8 +73,7 @@ def written_whole(path: Path, *, synced: bool = False) -> Iterator[Path]:
         os.replace(beside, path)
     except OSError as error:
         # A full disk names no file, or a temporary one of a library's.
-        full = error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-        if not full and error.filename not in (None, str(beside), str(path)):
+        if error.errno not in _FULL and error.filename not in (None, str(beside), str(path)):
             raise
         raise OSError(error.errno, error.strerror or str(error), str(path)) from error
     finally:
@@ -142,6 +142,12 @@ def folder_written_whole(path: Path, mark: str) -> Iterator[Path]:
             raise
         shutil.rmtree(before, ignore_errors=True)
         made = []
+    except OSError as error:
+        if error.errno not in _FULL and not str(error.filename).startswith(str(beside)):
+            raise
+        # Of a file that is gone by now: name the one that it would have been.
+        name = str(error.filename or path).replace(str(beside), str(path))
+        raise OSError(error.errno, error.strerror, name) from error
     finally:
         shutil.rmtree(beside, ignore_errors=True)
         for folder in made:

@@ -1,5 +1,4 @@
 import errno
-import resource
 
 import imageio.v3 as iio
 import pytest
@@ -126,14 +125,6 @@ def test_nothing_half_written_stays(tmp_path, suffix):
     with pytest.raises(ValueError, match=r"expected images of \(20, 30, 3\), .* but got \(20, 32, 3\)"):
         write_video(tmp_path / "a.mp4", [torch.zeros(20, width, 3) for width in (30, 32)], fps=10)
     assert list(tmp_path.iterdir()) == []
-
-
-@pytest.fixture
-def room():
-    """``room(size)`` is the most bytes that a file may have from then on, as on a disk that is full."""
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    yield lambda size: resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
-    resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
 @pytest.mark.parametrize("name", ["a.mp4", "a.gif", "a.png"])

@@ -103,3 +103,14 @@ def test_other_axes_and_methods_are_refused(particles, ball, tmp_path):
     with pytest.raises(ValueError, match="format=usd: expected a method made of particles, but got forward"):
         export(ball, tmp_path / "usd")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_full_disk_is_an_error_and_keeps_the_file_that_was_there(particles, tmp_path, room):
+    export(particles, tmp_path / "out")
+    before = (tmp_path / "out" / "scene.usdc").read_bytes()
+    room(2000)
+    with pytest.raises(OSError, match=r"too large|No space") as refused:
+        export(particles, tmp_path / "out")
+    assert refused.value.filename == str(tmp_path / "out" / "scene.usdc")
+    assert (tmp_path / "out" / "scene.usdc").read_bytes() == before
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]
