@@ -1,4 +1,5 @@
 import errno
+from pathlib import Path
 
 import imageio.v3 as iio
 import pytest
@@ -112,6 +113,12 @@ def test_gifs_folders_and_mp4_of_odd_sizes_hold_every_frame(tmp_path):
     frames = read_film(write_video(tmp_path / "videos" / "a.mp4", iter(drawn(7, 17, 21)), fps=5), 18, 22)
     assert frames.shape == (7, 18, 22, 3)
     assert abs(float(frames[6].mean()) - 255 * (0.2 + 0.8 * 6 / 7)) < 4
+
+
+def test_a_folder_may_be_called_like_an_address_or_a_pattern(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for name in ("http:a [1]/%d.mp4", "-b?.mp4"):
+        assert len(read_film(write_video(Path(name), drawn(3, 16, 20), fps=5).resolve(), 16, 20)) == 3
 
 
 @pytest.mark.parametrize("suffix", ["mp4", "gif"])

@@ -90,7 +90,7 @@ def train(config) -> float | None:
     with prepared.session():
         if prepared.measured:
             folder, reduce = prepared.run.folder, prepared.config.get("reduce")
-            words = f"run={folder}" + (f" reduce={reduce}" if reduce else "")
+            words = quote(f"run={folder}") + (f" reduce={reduce}" if reduce else "")
             print(f"measured before: {folder}; again with forewarp-evaluate {words}")
             return prepared.score.of()
         print(beginning(prepared.run, prepared.config), flush=True)

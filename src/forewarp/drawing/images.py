@@ -334,7 +334,7 @@ def _write_mp4(path: Path, frames: Iterable[np.ndarray], fps: float, sound: Path
     call += ["-s", f"{width}x{height}", "-r", str(fps), "-i", "-"]
     call += ["-an"] if sound is None else ["-i", str(sound), "-map", "0:v:0", "-map", "1:a:0", "-c:a", "aac"]
     call += ["-c:v", "libx264", "-crf", _CRF, "-pix_fmt", "yuv420p"]
-    call += ["-colorspace", "smpte170m", str(path)]  # as ffmpeg converts; else HD shows as BT.709
+    call += ["-colorspace", "smpte170m", f"file:{path}"]  # as ffmpeg converts; else HD shows as BT.709
     with tempfile.TemporaryFile() as said:  # no pipe, which would fill up
         with subprocess.Popen(call, stdin=subprocess.PIPE, stderr=said) as process:
             try:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
@@ -41,7 +42,8 @@ def arrays_of(row: Row) -> dict[str, np.ndarray]:
     try:
         return unpack_arrays(read_bytes(path, MOST_ARRAYS))
     except Exception as error:  # ValueError, BadZipFile, zlib.error and more
-        again = f"write it anew with forewarp-evaluate run={row['folder']}"
+        words = shlex.quote(f"run={row['folder']}")
+        again = f"write it anew with forewarp-evaluate {words}"
         raise ValueError(f"{path}: expected NumPy's arrays, but got {error}; {again}") from error
 
 

@@ -12,6 +12,7 @@ import io
 import json
 import math
 import re
+import shlex
 import statistics
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
@@ -385,7 +386,7 @@ def read_compared(folders: Sequence[str | Path]) -> dict[str, Runs]:
     for path in paths:
         if not path.is_dir():
             raise ValueError(f"runs: expected folders of runs, but got {path}, which is not there")
-        again, numbers = f"forewarp-evaluate run={path}", path / "metrics.json"
+        again, numbers = f"forewarp-evaluate {shlex.quote(f'run={path}')}", path / "metrics.json"
         if not numbers.is_file():
             raise ValueError(f"{numbers}: expected a run's numbers, but got none; make them with {again}")
         with refused(f"{path}: expected a measured run, but got ", f"; measure it with {again}"):

@@ -9,6 +9,7 @@ import io
 import ipaddress
 import logging
 import secrets
+import shlex
 import socket
 import time
 import traceback
@@ -259,7 +260,7 @@ def live(run: Run, *, host: str, port: int) -> Iterator[None]:
             yield
         finally:
             run.callbacks = before
-    run.tell(f"see it again: forewarp-view run={folder}")
+    run.tell(f"see it again: forewarp-view {shlex.quote(f'run={folder}')}")
 
 
 def check_address(host: str, port: int) -> None:
