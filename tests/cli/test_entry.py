@@ -268,6 +268,10 @@ def test_interruption_says_how_to_go_on(forewarp, monkeypatch, in_tmp, by, numbe
     [
         (SceneError("a.json: frames: expected a list,\n but got 1"), "a.json: frames: expected a list,; but"),
         (OSError(errno.ENOSPC, "No space left", "x/last.ckpt"), "x/last.ckpt: expected room to write, but"),
+        (
+            RuntimeError("[database.cc:68] database or disk is full"),
+            "a file: expected room to write, but got No",
+        ),
         (PermissionError(errno.EACCES, "Permission denied", "x"), "x: expected a usable file or folder, but"),
         (ImportError("install forewarp[synth]"), "install forewarp[synth]"),
         (

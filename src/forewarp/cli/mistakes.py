@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 import errno
 import inspect
+import os
 import re
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
@@ -215,6 +216,8 @@ def one_line(error: BaseException) -> str | None:
         cause = error.__cause__
         detail = f" ({flat(str(cause))})" if isinstance(cause, OmegaConfBaseException) else ""
         return flat(str(error).split("Config search path")[0]) + detail
+    if isinstance(error, RuntimeError) and re.search("disk is full|no space left", str(error), re.IGNORECASE):
+        error = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))  # of a library that writes by itself
     if isinstance(error, OSError):
         expected, advice = "a usable file or folder", "check that it exists and may be written"
         if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
