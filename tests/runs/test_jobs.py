@@ -86,6 +86,12 @@ def test_a_few_jobs_stand_for_many_unless_each_is_asked_for(sweep, monkeypatch):
     assert (len(composed), len(read)) == (4, 4)
 
 
+@pytest.mark.parametrize("word", ["target.plateau=-1", "budget.minutes=0"])
+def test_what_training_would_refuse_has_no_estimate(sweep, word):
+    with pytest.raises(ValueError, match=f"{word.partition('=')[0]}: expected"):
+        cost_of_sweep(sweep(*SMALL, word))
+
+
 def test_a_search_has_as_many_jobs_as_it_is_given(sweep):
     config = sweep(*SMALL, "evaluate=false")
     with read_write(config.hydra):

@@ -176,10 +176,11 @@ def job_of(config: DictConfig, rows: Sequence[Row] = (), *, read: bool = True) -
         read: whether to count the test views of a scene that is there, which reads all of it.
 
     Raises:
-        ValueError: for a budget that there cannot be.
+        ValueError: for a budget or a target that there cannot be.
     """
     from forewarp.clock import Clock
     from forewarp.training.schedule import check_budget
+    from forewarp.training.stopping import StopRule
 
     budget = config.budget
     check_budget(budget.minutes, budget.iterations)
@@ -199,7 +200,7 @@ def job_of(config: DictConfig, rows: Sequence[Row] = (), *, read: bool = True) -
         state = "skipped"
     stages = [stage for stage in config.stage.values() if stage is not None]
     may_end = any(stage.get("steps_per_picture") is not None for stage in stages)
-    may_end |= any(dB is not None for dB in (plain(config.get("target")) or {}).values())
+    may_end |= StopRule(**(plain(config.get("target")) or {})).is_set
     like = Row(**{**vars(like), "views": views, "pixels": pixels})
     plans = config.get("effects") == "auto"
     return Job(
