@@ -119,11 +119,18 @@ def with_sound(path, seconds):
     return tone(path, seconds, "-i", str(path), *shape)
 
 
+def npz_beside(path):
+    archive = path.with_name("hand_droid.npz")
+    archive.touch()
+    return archive
+
+
 @pytest.mark.parametrize(
     ("make", "says"),
     [
         (lambda p: p.write_text("no video") and p, "a video, but got another file"),
         (lambda p: p.touch() or p, "a video, but got another file"),
+        (npz_beside, "a video, but got another file; it is of MegaSaM: write its cameras and images as"),
         (lambda p: tone(p, 1), "a video, but got sound alone"),
         (lambda p: write_film(p, numbered(2)), "a video of many frames, but got 2 frames; film longer"),
         (lambda p: write_film(p, numbered(1)), "a video of many frames, but got one frame"),
@@ -478,3 +485,17 @@ def test_times_follow_gaps_in_names_or_say_that_they_do_not(tmp_path):
     frames = taken(tmp_path / "again", folder)
     assert list(frames.times.values()) == list(range(6))
     assert "so gaps are lost (expected names of one form, as 'f_0000', but got 'f_0034 (1)'" in frames.assumed
+
+
+@pytest.mark.parametrize(
+    ("file", "said"),
+    [
+        ("p/keyframes/images/1.jpg", "got none; keyframes is of Polycam's raw data: ns-process-data polycam"),
+        ("p/1.exr", "PNG or JPEG, but got EXR; export JPEG; of Record3D export .r3d"),
+    ],
+)
+def test_what_other_programs_leave_names_the_way(tmp_path, file, said):
+    (tmp_path / file).parent.mkdir(parents=True)
+    (tmp_path / file).touch()
+    with pytest.raises(ValueError, match=said):
+        taken(tmp_path, tmp_path / "p")

@@ -6,6 +6,8 @@ import platform
 import shlex
 import shutil
 import signal
+import subprocess
+import sys
 from importlib.metadata import version
 from pathlib import Path
 from types import SimpleNamespace
@@ -355,3 +357,10 @@ def test_a_pattern_of_names_is_taken_as_typed(ok, in_tmp, monkeypatch):
     monkeypatch.setattr("forewarp.cli.capture.capture", lambda config: seen.append(config.name_pattern))
     ok("capture", "images=x", "name_pattern=(?P<frame>[0-9]+)$")
     assert seen == ["(?P<frame>[0-9]+)$"]
+
+
+def test_a_terminal_that_knows_ascii_only_shows_other_characters_escaped():
+    code = "from forewarp.cli.entry import quiet; quiet(); print('Gr\u00f6\u00dfe')"
+    environment = {**os.environ, "PYTHONIOENCODING": "ascii"}
+    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, check=True)
+    assert done.stdout.strip() == rb"Gr\xf6\xdfe"

@@ -272,3 +272,12 @@ def test_gaps_in_frame_numbers_are_gaps_in_time(folder):
     scene = read_scene(folder.parent, "toy")
     assert scene.times == pytest.approx((0, 0.2, 0.8, 1))
     assert "times are those of the numbers in the images' names" in scene.protocol["assumed"][0]
+
+
+def test_one_camera_is_tested_on_moments_alone(tmp_path):
+    for n in range(4):
+        write_image(tmp_path / "toy" / "cam00" / f"{n:04d}.png", grey(CAMERAS[0], n, 0))
+    write_poses(tmp_path / "toy", CAMERAS[:1], near=14.0, far=30.0)
+    with refused("a camera or a moment to test on, but got none; name some in"):
+        read_scene(tmp_path, "toy")
+    assert len(read_scene(tmp_path, "toy", test_moments=[1]).train) == 3

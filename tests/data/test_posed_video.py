@@ -629,3 +629,10 @@ def test_what_looks_like_masks_depth_or_a_lens_and_is_not_read_is_named(tmp_path
     assert re.search("json: integer_depth_scale, rolling_shutter, mask_filename, depth_path: not read", said)
     edit(folder / FILE, {"frames.0.mask_path": "masks/a.png"})
     assert "masks_2/" not in "\n".join(read_scene(tmp_path, "toy", masks="off").protocol["assumed"])
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_one_or_two_images_are_refused(tmp_path, count):
+    write_video(tmp_path / "toy", count=count)
+    with refused(f"at least 3 images, one of them to test on, but got {count}; take more images"):
+        read_scene(tmp_path, "toy")

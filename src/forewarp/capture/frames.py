@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from torch.nn.functional import adaptive_max_pool2d, interpolate
 
-from forewarp.data.files import SUFFIXES, UNREAD, SceneError, composed, mismatch
+from forewarp.data.files import SUFFIXES, UNREAD, SceneError, composed, mismatch, way_from, way_from_file
 from forewarp.data.images import bright, by, common_header, read_image, write_image
 from forewarp.data.names import in_order, read_names
 from forewarp.data.video import HDR, Log, decode, deinterlacing, extracted, hdr_of, hdr_unsaid
@@ -246,7 +246,8 @@ def _from_folder(folder: Path, source: Source, step: Step) -> dict:
     paths = images_in(source.images, as_stored)
     if len(paths) < _MIN_IMAGES:
         got = f"{len(paths)} PNG or JPEG files" if paths else "none"
-        raise mismatch(source.images, "a folder of many pictures, PNG or JPEG", got)
+        advice = way_from(source.images)
+        raise mismatch(source.images, "a folder of many pictures, PNG or JPEG", got, advice)
     rows = {path: row for row, path in enumerate(paths)}
     names = [path.relative_to(source.images).with_suffix("").as_posix() for path in paths]
     where, read, numbers = source.images, None, rows
@@ -309,6 +310,7 @@ def images_in(folder: Path, deep: bool = False) -> list[Path]:
     others = sorted(p for p in files if p.suffix.lower() in UNREAD)
     if others and not (deep and images):
         kind, advice = others[0].suffix[1:].upper(), "convert the pictures to JPEG"
+        advice = "export JPEG; of Record3D export .r3d, for video=SCAN.r3d" if kind == "EXR" else advice
         advice += ", or set the phone's camera to its most compatible format" if kind[:3] == "HEI" else ""
         raise mismatch(others[0], "PNG or JPEG", kind, advice)
     return in_order(images)
@@ -520,7 +522,7 @@ def _refuse(video: Path, log: Log, count: int) -> None:
     """Refuse what gives no frames, too few, or fewer than the file promises."""
     stamps, text = log.stamps, "".join(log.rest)
     if not count:
-        got = "another file; choose a video, or images="
+        got = f"another file; {way_from_file(video) or 'choose a video, or images='}"
         with video.open("rb") as stream:
             if "moov atom not found" in text and stream.read(8).endswith(b"ftyp"):
                 got = "one that was cut off; copy it again"

@@ -244,8 +244,11 @@ def composed(name: str) -> str:
 
 @lru_cache(16)
 def _names_in(folder: str, changed: int) -> dict[str, str]:
-    """Return the names in a folder by their composed form; ``changed`` tells its states apart."""
-    return {composed(name): name for name in os.listdir(folder)}
+    """Return the names in a folder by their composed form; ``changed`` tells its states apart.
+
+    Where the system's encoding is ASCII, names come as bytes in disguise.
+    """
+    return {composed(os.fsencode(n).decode(errors="surrogateescape")): n for n in os.listdir(folder)}
 
 
 @dataclass(frozen=True)
@@ -373,12 +376,18 @@ def way_from(folder: Path) -> str:
     nothing where that is not known.
     """
     for who, mark, way in _FOREIGN:
-        is_folder, mark = mark.endswith("/"), mark.rstrip("/")
         beside = folder.parent.glob(f"{glob.escape(folder.name)}{mark}") if mark.startswith("*") else ()
-        found = next((path for path in (*folder.glob(mark), *beside) if path.is_dir() == is_folder), None)
+        paths = (*folder.glob(mark.rstrip("/")), *beside)
+        found = next((path for path in paths if path.is_dir() == mark.endswith("/")), None)
         if found is not None:
             return f"{found.name} is of {who}: {way.format(found.parent)}"
     return ""
+
+
+def way_from_file(path: Path) -> str:
+    """Say as ``way_from`` which program left a file."""
+    known = ((who, way) for who, mark, way in _FOREIGN if not mark.endswith("/") and path.match(mark))
+    return next((f"it is of {who}: {way.format(path.parent)}" for who, way in known), "")
 
 
 def remove(folder: Path, *patterns: str) -> None:

@@ -31,7 +31,7 @@ from torch import Tensor
 from forewarp.data import files
 from forewarp.data.arrays import read_cloud, read_truth, write_array, write_truth
 from forewarp.data.cameras import MOST_UNITS, Normalisation, box_of, check_camera, frustum_box, pose_of
-from forewarp.data.depth import SensedDepth, depths_beside, unit_of
+from forewarp.data.depth import METRIC, SensedDepth, depths_beside, refuse_other_kind, unit_of
 from forewarp.data.directions import by_translation, opposite, other_readings, transposed
 from forewarp.data.files import (
     Entry,
@@ -39,6 +39,7 @@ from forewarp.data.files import (
     inside,
     mismatch,
     number,
+    one_of,
     read_json,
     remove,
     scene_folder,
@@ -101,6 +102,7 @@ def read_scene(
     scale: int = 2,
     box: Sequence[float] | None = None,
     depth: str | None = None,
+    depth_kind: str | None = None,
     split: str | None = None,
 ) -> Scene:
     """Read ``root/scene``; pixels are decoded when a frame is first loaded.
@@ -113,6 +115,8 @@ def read_scene(
         scale: which of the stored sizes, sides ``scale`` times smaller than the full-size image.
         box: x0 y0 z0 x1 y1 z1 in normalised units; None takes the bounds of all training rays.
         depth: folder of the training images' depth, ``depth`` of dycheck's captures; None: none is used.
+        depth_kind: along the optical ``axis`` or the pixel's ``ray``; None: along the axis, unless views
+            agree much better along rays, which is refused.
         split: ``mono``, ``intl`` or another ending of names in ``splits/``: ``train_mono``, ``val_mono``;
             None: ``train`` and ``val``, where these are there, else the lists of ``dataset.json``.
 
@@ -120,6 +124,7 @@ def read_scene(
         SceneError: for every file or value that is missing or wrong, with file and key.
     """
     folder = scene_folder(root, scene, "HyperNeRF")
+    one_of(depth_kind, "data.depth_kind", *METRIC, None)
     images = folder / "rgb" / f"{whole(scale, 'data.scale', 1)}x"
     if not images.is_dir():
         there = ", ".join(in_order(p.name for p in folder.glob("rgb/*x") if p.is_dir())) or "none"
@@ -170,7 +175,7 @@ def read_scene(
         if item in depths:
             trust = folder / "confidence" / f"{scale}x" / f"{item}.npy"
             trust = trust if trust.is_file() else None
-            options["load_sensed"] = SensedDepth(depths[item], camera, unit, trust)
+            options["load_sensed"] = SensedDepth(depths[item], camera, unit, trust, depth_kind or "axis")
         mask = folder / "covisible" / f"{scale}x" / of_test / f"{item}.png"
         if mask.is_file():
             inspect_image(mask, size, f" as {path.name}")
@@ -183,6 +188,8 @@ def read_scene(
         return Frame(item, time, camera, load, camera_id=camera_ids[item], **options)
 
     train, test = (tuple(map(frame, items)) for items in (train_ids, test_ids))
+    if depths and depth_kind is None:
+        refuse_other_kind([f.load_sensed for f in train if f.load_sensed], None, folder / depth)
     splits = {"train": train_ids, "val": test_ids}
     numbered = {split: {item: numbers[item] for item in items} for split, items in splits.items()}
     check_times(numbered, str(folder / "metadata.json"))

@@ -138,7 +138,8 @@ def read_scene(
     turned = [path for track in tracks for path in track.images[:count] if path in track.turned]
     assumed += ordered + exif_turned(turned, folder)
     assumed += side_files([folder], [], "this layout has none: use experiment=video_with_poses for them")
-    held, moments = held_cameras(test_cameras, list(paths), [0]), held_moments(test_moments, count)
+    default = [0] if len(paths) > 1 else []  # one camera may be tested on moments
+    held, moments = held_cameras(test_cameras, list(paths), default), held_moments(test_moments, count)
     factors = [_factor(track, camera, scale) for track, camera in zip(tracks, whole_cameras)]
     cameras = [camera.smaller(scale) for camera in whole_cameras]
     bytes_of_all = 4 * count * sum(camera.width * camera.height for camera in cameras)

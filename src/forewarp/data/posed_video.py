@@ -435,6 +435,9 @@ def _split_entries(
             parts["train"], parts["test"] = hold_out_every(parts["train"], test_every)
             how += f", no image of test_filenames is there: every {test_every}th training frame held out"
     else:
+        if len(entries) < 3:
+            advice = "take more images; of two, name one in test_filenames"
+            raise mismatch(file, "at least 3 images, one of them to test on", len(entries), advice)
         train, test = hold_out_every(entries, test_every)
         parts = {"train": train, "val": [], "test": test}
         how = f"every {test_every}th frame held out"

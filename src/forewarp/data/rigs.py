@@ -76,6 +76,9 @@ def split_rig(
             train.append(frame)
         elif ability != "space" or moment % every == 0:
             test.append(replace(frame, ability=ability))
+    if not train:
+        advice = "hold out fewer in data.test_cameras and data.test_moments"
+        raise mismatch("data.test_cameras", "a camera and a moment to train on", "none", advice)
     if not test:
         advice = "name some in data.test_cameras or data.test_moments"
         raise mismatch("data.test_cameras", "a camera or a moment to test on", "none", advice)
