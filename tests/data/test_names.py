@@ -97,6 +97,8 @@ def test_cameras_beside_each_other_that_move_on_are_a_rig():
         (["3f2a91", "b07c44", "aa1f03", "9c8e77", "d4d5e6"], "what is beside the numbers differs"),
         (in_groups("{}_{:03d}", range(3), range(4)), r"names as '0_000': .* \(4 times\), or .* \(12 times\)"),
         ([f"IMG_20231115_1704{i:02d}" for i in range(9)] + ["IMG_20231115_170403 (1)"], r"'IMG_.*1\)'; ren"),
+        ([f"IMG_{i:04d}" for i in range(8)] + ["IMG_0003 copy"], "'IMG_0000', but got 'IMG_0003 copy'; rena"),
+        ([f"IMG_{i:04d}" for i in range(8)] + ["IMG_E0003"], "but got 'IMG_E0003'; rename"),
         ([f"r_{i:03d}" for i in range(30)] + ["r_90000"], "number of r_90000: expected .* 1 to 28"),
         (in_groups("train/{1:03d}{0}", [""], range(150)) + in_groups("test/{1:03d}{0}", [""], range(20)),
          "one numbering of all images, 0 to 149, but got 0 to 19 for 'test/000'"),
@@ -114,10 +116,22 @@ def test_names_of_several_readings_are_refused(names, said):
         read_names(names, "t.json")
 
 
-@pytest.mark.parametrize("form", ["seq-{:02d}/frame-{:06d}", "clip{}_frame{:04d}", "c{}_{:05d}"])
-def test_words_that_positions_contradict_are_refused(form):
+@pytest.mark.parametrize(
+    ("form", "parts"),
+    [("seq-{:02d}/frame-{:06d}", range(3)), ("clip{}_frame{:04d}", range(3)), ("c{}_{:05d}", range(3)),
+     ("film{}_{:04d}", "ABC"), ("{}/{:04d}", ["first", "last", "mid"])],
+)  # fmt: skip
+def test_words_that_positions_contradict_are_refused(form, parts):
     with refused("positions continue one path; .*data.name_pattern"):
-        read_names(in_groups(form, range(3), range(4)), "t.json", views=PATH)
+        read_names(in_groups(form, parts, range(4)), "t.json", views=PATH)
+
+
+def test_two_cameras_that_return_to_where_they_began_are_a_rig():
+    angles = 2 * np.pi * np.arange(24) / 24
+    ring = np.stack([np.cos(angles), np.sin(angles), np.zeros(24)], 1)
+    views = [*ring.tolist(), *(1.1 * ring).tolist()]
+    found = read_names(in_groups("{}/{:04d}", ["left", "right"], range(24)), "t.json", views=views)
+    assert found.frames == [*range(24)] * 2
 
 
 def test_names_that_say_nothing():

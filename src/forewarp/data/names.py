@@ -38,6 +38,7 @@ _CLOCK = re.compile(r"([01]\d|2[0-3])([0-5]\d)([0-5]\d)?")  # digits that may be
 _ODD = 0.2  # share of the names that may have another form than all others, and are then named in the error
 _LEAST_WORDS = 4  # different texts beside the numbers, from which on these may tell nothing
 _CARRY = 3.0  # steps of the last number from its end and its beginning within which it is carried over
+_ODD_ALONE = 4  # images of a camera from which on one of a single image is an odd name
 _SAME_FRAMES = 0.8  # share of all frame numbers that each camera must have where no word tells the camera
 _SPAN = 0.8  # share of the whole sequence that each camera's, or each split's, frame numbers must span
 _COUNTER_DIGITS = 3  # from which a counter may begin anew after its last number
@@ -401,9 +402,12 @@ def _chosen(
         reading = of_place((named or free)[-1], places)
         if not reading.is_unique:
             return None
-        film = _Reading(together, _ranked(rows, places), [()] * len(rows))
+        parts = [(tuple(row[i] for i in texts), *(float(row[i]) for i in places)) for row in rows]
+        order = {part: float(rank) for rank, part in enumerate(sorted({*parts}))}
+        film = _Reading(together, [order[part] for part in parts], [()] * len(rows))
         is_shared = len({*reading.frames}) < len(rows) and film.is_unique
-        if is_shared and views is not None and _path(reading, film, views) == "film":
+        is_film = is_shared and views is not None and _path(reading, film, views) == "film"
+        if is_film and not _returns(reading, views):
             raise _two_ways(where, name, "words tell cameras, whose positions continue one path")
         return reading
     count = "number {} of each name counts frames, the others tell cameras"
@@ -502,6 +506,14 @@ def _path(rig: _Reading, film: _Reading, views: Sequence[Sequence[float]]) -> st
     return "film" if ratio <= _ONE_PATH else "rig" if ratio >= _JUMPS else None
 
 
+def _returns(rig: _Reading, views: Sequence[Sequence[float]]) -> bool:
+    """Tell whether the first camera ends where it began, so that another may begin there, too."""
+    mine = [i for i, camera in enumerate(rig.cameras) if camera == rig.cameras[0]]
+    way = np.asarray(views, np.float64)[sorted(mine, key=lambda i: rig.frames[i])]
+    steps = np.linalg.norm(np.diff(way, axis=0), axis=-1)
+    return len(way) < 2 or float(np.linalg.norm(way[-1] - way[0])) < 2 * median(steps.tolist())
+
+
 def _unrolled(reading: _Reading) -> tuple[list[float], str]:
     """Continue a counter that began anew after its last number, as 9999; also say what was read."""
     frames, told = reading.frames, f"{reading.what}, {min(reading.frames):.10g} to {max(reading.frames):.10g}"
@@ -564,6 +576,10 @@ def _check_groups(
     letters = [tuple(re.sub("[^a-z0-9/]", "", part.lower()) for part in camera) for camera in reading.cameras]
     if len(groups) > len(names) / 2 or not replace(reading, cameras=letters).is_unique:
         raise _two_ways(where, names[0], "what is beside the numbers differs from image to image")
+    for group, camera in zip(groups, dict.fromkeys(reading.cameras)):
+        if len(group) == 1 and max(map(len, groups)) > _ODD_ALONE and not _SPLIT_WORD.search(first[camera]):
+            expected = f"names of one form, as '{next(n for n in names if n != first[camera])}'"
+            raise mismatch(where, expected, f"'{first[camera]}'", f"rename it, or {KEY}")
     step = min(b - a for a, b in zip(everything, everything[1:]))
     for group, camera in zip(groups, dict.fromkeys(reading.cameras)):
         span = max(group) - min(group)
