@@ -146,6 +146,8 @@ def test_a_pattern_settles_every_case():
     found = read_names(names, "t.json", r"(?P<camera>\d)_(?P<frame>\d+)")
     assert (found.frames, found.cameras) == ([4, 6, 4, 6], ["0", "0", "1", "1"])
     assert read_names(["a1.5", "a2"], "t.json", r"a(?P<time>[\d.]+)").frames == [1.5, 2]
+    films = [f"clip{c}_{f}" for c, f in ((1, 0), (1, 2), (2, 0), (10, 0))]
+    assert read_names(films, "t.json", r"(?P<part>\d+)_(?P<frame>\d+)").frames == [0, 2, 4, 6]
     clocks = ["x_10-05-59", "x_10-06-01.5", "x_00:07"]
     assert read_names(clocks, "t.json", "_(?P<time>.*)").frames == [36359, 36361.5, 7]
     dated = read_names(["2024-05-01 23.59.59", "2024-05-02 00.00.01"], "t.json", "(?P<time>.*)")

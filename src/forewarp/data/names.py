@@ -163,7 +163,8 @@ def read_names(
         names: paths of the images without suffix, ``cam01/0003``; of all splits together.
         where: what the names are of, for errors.
         pattern: regular expression with a group ``time`` (a number, or a time of day as 10-05-30) or
-            ``frame``, and ``camera`` for a rig, that is found in every name; None: see the rules below.
+            ``frame``, and ``camera`` for a rig, ``part`` for films one after the other, that is found in
+            every name; None: see the rules below.
         views: a row of numbers for each image, near where cameras stand and look alike, such as their
             positions; they tell cameras of a rig from parts of one film.
 
@@ -236,6 +237,11 @@ def _by_pattern(names: Sequence[str], where: str, pattern: str) -> NameNumbers:
         if not math.isfinite(frames[-1]):
             got = f"'{match[groups[0]]}' of '{name}'"
             raise mismatch(f"data.name_pattern: group {groups[0]}", "a number", got)
+    if "part" in compiled.groupindex:
+        parts = [match["part"] or "" for match in matches]
+        rank = {part: str(n) for n, part in enumerate(in_order({*parts}))}
+        rows = [["", rank[part], "", f"{frame:.10g}"] for part, frame in zip(parts, frames)]
+        frames = _ranked(rows, [1, 3])
     cameras = [match["camera"] for match in matches] if "camera" in compiled.groupindex else None
     reading = _Reading("", frames, [(camera,) for camera in cameras or [""] * len(names)])
     if not reading.is_unique:
@@ -244,7 +250,8 @@ def _by_pattern(names: Sequence[str], where: str, pattern: str) -> NameNumbers:
         twice = next(i for i, pair in enumerate(pairs) if pair in seen or seen.add(pair))
         expected = f"each {groups[0]} once" if cameras is None else f"each {groups[0]} once a camera"
         got = f"{frames[twice]:g} again in '{names[twice]}'"
-        advice = "name the camera by a group 'camera'" if cameras is None else ""
+        advice = "name the camera by a group 'camera', or films one after the other by 'part'"
+        advice = advice if cameras is None else ""
         raise mismatch("data.name_pattern", expected, got, advice)
     refuse_far(dict(zip(names, frames)), where, "time", "rename it, or set another data.name_pattern")
     return NameNumbers(frames, cameras, "taken from the images' names by data.name_pattern")
