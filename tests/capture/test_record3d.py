@@ -64,7 +64,7 @@ def test_a_scan_becomes_a_scene_with_its_poses_and_depth(tmp_path):
     assert json.loads((tmp_path / "a" / "capture.json").read_text()) == facts
     assert summary(facts)[0] == "frames: 9 of 9, 36 x 48 pixels, 0.3 s"
     scene = read_scene(tmp_path, "a", normalise=False)
-    assert scene.protocol["depth"] == f"metric, of {len(scene.train)} of {len(scene.train)} training frames"
+    assert scene.protocol["depth"] == f"axis, of {len(scene.train)} of {len(scene.train)} training frames"
     assert scene.protocol["seconds"] == pytest.approx(8 / 30)
     frame = scene.train[2]
     assert (frame.time, frame.name) == (pytest.approx(0.25), "images/000002")
