@@ -1,9 +1,11 @@
 import io
+import sys
 
 import pytest
+from rich.table import Table
 
 from forewarp import progress
-from forewarp.progress import Counted, ProgressLine
+from forewarp.progress import Counted, PrintableStream, ProgressLine, TextConsole, printable_output
 
 
 class Terminal(io.StringIO):
@@ -37,3 +39,29 @@ def test_a_terminal_gets_a_bar_that_is_not_drawn_too_often(monkeypatch):
     text = stream.getvalue()
     assert all(part in text for part in ("fine", "50% | 1:05 left | psnr 30 dB", "100% | done", "━"))
     assert text.endswith("\x1b[?25h")  # the cursor is back
+
+
+STEERING = "a\x1b]0;title\x07\x1b[2Jb\x9b1A\u202ec\r"
+
+
+def test_no_name_steers_the_terminal(capsys):
+    with printable_output():
+        print(STEERING, "\ttab\nline")
+        print(STEERING, file=sys.stderr)
+        TextConsole().print(STEERING, markup=False)
+        table = Table(STEERING)
+        table.add_row(STEERING)
+        TextConsole().print(table)
+    said = capsys.readouterr()
+    assert not set("\x1b\x07\x9b\u202e\r") & {*said.out, *said.err}
+    assert "\ttab\nline" in said.out
+    assert r"a\x1b]0;title\x07\x1b[2Jb\x9b1A\u202ec\r" in said.err
+    print("\x1b")
+    assert capsys.readouterr().out == "\x1b\n"  # of others as it was
+
+
+def test_a_terminal_that_knows_no_such_letter_gets_its_number():
+    raw = io.TextIOWrapper(io.BytesIO(), "ascii")
+    print("José \udcff", file=PrintableStream(raw))
+    raw.flush()
+    assert raw.buffer.getvalue() == rb"Jos\xe9 \udcff" + b"\n"

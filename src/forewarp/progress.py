@@ -1,7 +1,10 @@
-"""Show progress in one line: redrawn in a terminal, printed from time to time elsewhere."""
+"""Show progress in one line: redrawn in a terminal, printed from time to time elsewhere; and text of others
+so that it cannot steer the terminal.
+"""
 
 from __future__ import annotations
 
+import re
 import sys
 import threading
 import time
@@ -11,7 +14,64 @@ from typing import TextIO
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn
+from rich.segment import Segment
 from rich.table import Column
+
+# Control characters but for tabs and new lines, and those that turn the direction of writing.
+_STEERING = re.compile("[\0-\x08\x0b-\x1f\x7f-\x9f\u2028\u2029\u202a-\u202e\u2066-\u2069]")
+
+
+def printable(text: str) -> str:
+    """Write characters that would steer a terminal as Python does.
+
+    >>> print(printable("a\\x1b[2Jb"))
+    a\\x1b[2Jb
+    """
+    return _STEERING.sub(lambda sign: ascii(sign[0])[1:-1], text)
+
+
+class PrintableStream:
+    """A stream in whose text no name of a file or scene steers the terminal; what the terminal's encoding
+    lacks is written as Python does, too.
+    """
+
+    def __init__(self, stream: TextIO) -> None:
+        self.terminal = stream
+
+    def write(self, text: str) -> int:
+        """Write text; return how many characters it has."""
+        encoding, shown = getattr(self.terminal, "encoding", None) or "utf-8", printable(text)
+        self.terminal.write(shown.encode(encoding, "backslashreplace").decode(encoding))
+        return len(text)
+
+    def __getattr__(self, name: str) -> object:
+        return getattr(self.terminal, name)
+
+
+@contextmanager
+def printable_output() -> Iterator[None]:
+    """Let what is printed within steer no terminal."""
+    before = sys.stdout, sys.stderr
+    sys.stdout, sys.stderr = (
+        one if isinstance(one, PrintableStream) else PrintableStream(one) for one in before
+    )
+    try:
+        yield
+    finally:
+        sys.stdout, sys.stderr = before
+
+
+class TextConsole(Console):
+    """Rich's console on stdout or a stream: it steers the terminal itself, but by no text that it shows."""
+
+    def __init__(self, stream: TextIO | None = None) -> None:
+        stream = stream or sys.stdout
+        super().__init__(file=stream.terminal if isinstance(stream, PrintableStream) else stream)
+
+    def render(self, *given, **options) -> Iterator[Segment]:
+        """Render as rich does, control characters of text as Python writes them."""
+        for part in super().render(*given, **options):
+            yield part if part.control else Segment(printable(part.text), part.style)
 
 
 def time_text(seconds: float) -> str:
@@ -100,7 +160,7 @@ class ProgressLine:
                 TextColumn("{task.fields[text]}", markup=False, table_column=Column(ratio=1, no_wrap=True)),
             )
             # Without a thread of its own it costs nothing between two updates.
-            console = Console(file=self.stream)
+            console = TextConsole(self.stream)
             self._bar = Progress(*columns, console=console, auto_refresh=False, expand=True)
             self._task = self._bar.add_task(self.title, total=1.0, text="")
             self._bar.start()

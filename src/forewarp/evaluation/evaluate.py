@@ -12,7 +12,6 @@ from statistics import fmean, median
 
 import torch
 from rich import box
-from rich.console import Console
 from rich.table import Table
 from torch import Tensor
 
@@ -25,7 +24,7 @@ from forewarp.methods.method import CarriesPixels, HasEllipsoids, HasLayers, Has
 from forewarp.metrics.geometry import end_point_error
 from forewarp.metrics.registry import METRICS, ImageSuite, described, scores_of_parts, summarise
 from forewarp.ops.grid import block_means, reduced_depth
-from forewarp.progress import time_text
+from forewarp.progress import TextConsole, time_text
 from forewarp.provenance import versions
 from forewarp.scene.frame import Scene, spread, walk_of
 from forewarp.scene.view import Moment, Rendering, Target, View
@@ -372,7 +371,7 @@ def _depth_parts(rendering: Rendering, target: Target) -> list[Tensor]:
 
 def show(metrics: dict, folder: Path, absent: dict[str, str]) -> None:
     """Print the numbers and the paths of the files."""
-    console, seconds, flow = Console(), metrics["seconds"], metrics.get("flow")
+    console, seconds, flow = TextConsole(), metrics["seconds"], metrics.get("flow")
     console.print(table_of(metrics))
     others = ("train", "render_per_frame", "render_again_per_frame")
     stages = ", ".join(f"{name} {time_text(s)}" for name, s in seconds.items() if name not in others)

@@ -110,10 +110,9 @@ def own_folder(typed: Sequence[str]) -> list[str]:
 def show_plan(made: dict, *, to_fit: bool = True) -> None:
     """Print a plan as a table; ``to_fit`` adds the command that fits it."""
     from rich import box
-    from rich.console import Console
     from rich.table import Table
 
-    from forewarp.progress import time_text
+    from forewarp.progress import TextConsole, time_text
 
     title = f"planned {'before, ' if made.get('found') else ''}in {time_text(made['seconds'])}"
     if fit := made.get("fit"):
@@ -124,7 +123,7 @@ def show_plan(made: dict, *, to_fit: bool = True) -> None:
         table.add_column(name, overflow="fold")
     for effect, decision in made["effects"].items():
         table.add_row(effect, decision["choice"], decision["because"])
-    console = Console()
+    console = TextConsole()
     console.print(table)
     if to_fit:
         console.print(f"fit it: forewarp-train plan={made['file']}", soft_wrap=True, highlight=False)
