@@ -38,9 +38,11 @@ def _one_thread():
 
 @pytest.fixture(scope="session", autouse=True)
 def _times_of_tests(tmp_path_factory):
-    """What jobs of tests take is kept apart from the user's."""
+    """What jobs of tests take is kept apart from the user's, and what is noted of decoded frames."""
+    own = tmp_path_factory.mktemp("own")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("FOREWARP_TIMES", str(tmp_path_factory.mktemp("times") / "times.csv"))
+        patch.setenv("FOREWARP_TIMES", str(own / "times.csv"))
+        patch.setattr("forewarp.files.own_folder", lambda: own)
         yield
 
 

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from forewarp.archives import read_archive, write_archive
-from tests.support.limits import least_memory
+from forewarp.files import memory_within
 
 STORAGE = b"X\x07\x00\x00\x00storagectorch\nFloatStorage\nX\x01\x00\x00\x000X\x03\x00\x00\x00cpu"
 OURS = {"a": torch.arange(6.0).reshape(2, 3), "b": {"c": [1, (2, 0.5)], "d": None}, 3: True}
@@ -63,7 +63,7 @@ def test_what_we_write_is_read(tmp_path):
 @pytest.mark.parametrize("kind", HOSTILE)
 def test_a_kilobyte_asks_for_no_more_than_it_holds(tmp_path, kind):
     path, began = archive(tmp_path / "a.pt", HOSTILE[kind]), time.perf_counter()
-    with least_memory(1 << 28), pytest.raises(ValueError, match="RefusedArchive"):
+    with memory_within(1 << 28), pytest.raises(ValueError, match="RefusedArchive"):
         read_archive(path)
     assert time.perf_counter() - began < 2
 

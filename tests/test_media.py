@@ -12,9 +12,9 @@ from PIL import Image
 from forewarp.data.images import inspect_image
 from forewarp.data.video import header_of, stamps_of
 from forewarp.drawing.images import read_image, video_within
+from forewarp.files import memory_within
 from forewarp.media import image_bytes
 from tests.support.films import numbered, write_film
-from tests.support.limits import least_memory
 
 EPS = b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 8 8\n(/tmp/x) (w) file closefile\n%%EOF\n"
 
@@ -40,7 +40,7 @@ def test_what_is_no_image_reaches_no_other_program(tmp_path, monkeypatch, conten
     monkeypatch.setattr(subprocess, "Popen", None)
     (tmp_path / "a.png").write_bytes(content)
     for read in (read_image, image_bytes, inspect_image):
-        with least_memory(1 << 28), pytest.raises(ValueError, match=r"a.png: expected (a PNG|an image)"):
+        with memory_within(1 << 28), pytest.raises(ValueError, match=r"a.png: expected (a PNG|an image)"):
             read(tmp_path / "a.png")
 
 

@@ -370,6 +370,40 @@ def check_size(path: Path, most: int) -> None:
         raise ValueError(f"{path}: expected at most {most} bytes, but got {about.st_size}")
 
 
+def own_folder() -> Path:
+    """Return the user's own folder for what forewarp keeps between runs, which no one else ships."""
+    try:
+        cache = Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser()
+    except RuntimeError:  # a user without a home
+        cache = Path(os.devnull)  # in which nothing is read or written
+    return cache / "forewarp"
+
+
+@contextmanager
+def memory_within(more: int) -> Iterator[None]:
+    """Let this process take at most so many bytes beside what it has, where the system knows such a limit.
+
+    For libraries that take as much as a file says before they look whether it has that much.
+
+    Raises:
+        MemoryError: within, where they ask for more.
+    """
+    try:
+        import resource
+
+        used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+        soft, hard = resource.getrlimit(resource.RLIMIT_AS)
+        known = [limit for limit in (used + more, soft, hard) if limit != resource.RLIM_INFINITY]
+        resource.setrlimit(resource.RLIMIT_AS, (min(known), hard))
+    except (ImportError, OSError, ValueError):  # no Linux
+        yield
+        return
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_AS, (soft, hard))
+
+
 def unpack_arrays(data: bytes) -> dict[str, np.ndarray]:
     """Return the arrays of an .npz by name.
 

@@ -8,6 +8,7 @@ import time
 import pytest
 import torch
 
+from forewarp import files
 from forewarp.data import films
 from forewarp.data.films import STORE, Film, FilmStore, films_of
 from forewarp.data.images import CACHE
@@ -146,6 +147,26 @@ def test_a_file_that_was_cut_off_or_removed_is_made_again(film, tmp_path):
     assert (store.frame(film, 2) == expected).all()
     file.unlink()
     assert (store.frame(film, 2) == expected).all()
+
+
+def test_frames_that_came_with_a_scene_are_not_believed(film, tmp_path):
+    expected = FilmStore(tmp_path).frame(film, 2)
+    (file,) = tmp_path.glob("*.rgb")
+    file.write_bytes(bytes(BYTES))  # as large as its own
+    assert (FilmStore(tmp_path).frame(film, 2) == expected).all()
+    other = FilmStore(tmp_path / "other")
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / file.name).symlink_to(file)
+    assert (other.frame(film, 2) == expected).all()
+    assert not (tmp_path / "other" / file.name).is_symlink()
+    store = FilmStore(tmp_path)
+    assert (store.frame(film, 2) == expected).all()
+    file.write_bytes(bytes(BYTES))
+    os.utime(file, (1, 1))
+    assert (store.frame(film, 2) == expected).all()
+    (note,) = (files.own_folder() / "frames").glob(f"{film.key}.json")
+    note.unlink()
+    assert not FilmStore(tmp_path)._has(film)
 
 
 def test_too_little_room_is_refused_in_a_line_and_nothing_is_written(film, tmp_path, monkeypatch):

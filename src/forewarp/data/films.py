@@ -6,6 +6,7 @@ import errno
 import hashlib
 import os
 import shutil
+import stat
 import sys
 import time
 from collections.abc import Iterable, Iterator, Sequence
@@ -18,11 +19,12 @@ import torch
 from filelock import FileLock, Timeout
 from torch import Tensor
 
+from forewarp import files
 from forewarp.clock import left_out
 from forewarp.data.files import mismatch, number
 from forewarp.data.images import CACHE, by
 from forewarp.data.video import extracted, start_of
-from forewarp.files import written_whole
+from forewarp.files import read_json, write_json, written_whole
 from forewarp.progress import Counted
 
 FOLDER = ".frames"  # hidden, so that it belongs to no scene's fingerprint
@@ -63,12 +65,7 @@ class Film:
     def key(self) -> str:
         """Name what is decoded: a hash of the video's size, time, 64 of its blocks and the size of frames."""
         about = self.path.stat()
-        digest = hashlib.sha256(f"1 {about.st_size} {about.st_mtime_ns} {by(self.size)}".encode())
-        with self.path.open("rb") as file:
-            for i in range(_BLOCKS):
-                file.seek(i * max(about.st_size - _BLOCK, 0) // (_BLOCKS - 1))
-                digest.update(file.read(_BLOCK))
-        return digest.hexdigest()[:24]
+        return _digest(self.path, f"1 {about.st_size} {about.st_mtime_ns} {by(self.size)}")[:24]
 
     def decoded(self, start: int, count: int) -> Iterator[np.ndarray]:
         """Decode ``count`` frames from number ``start`` on: uint8 (H, W, 3) each.
@@ -122,8 +119,9 @@ class FilmStore:
 
     A file has the name of what it holds (``Film.key``), so that runs share it, and a video that has changed
     gets another. It appears whole or not at all, so that a killed process leaves no wrong frame; films that
-    it had finished stay. One process at a time decodes a film; others wait for it. Files that nobody has
-    read for an hour make room for new ones, the least recently read first.
+    it had finished stay. What it holds is noted in the user's own folder: a file that another user, or the
+    maker of the scene, has put there is decoded anew. One process at a time decodes a film; others wait for
+    it. Files that nobody has read for an hour make room for new ones, the least recently read first.
 
     Args:
         folder: of the files; made when needed. None: the films' own, ``.frames`` beside them.
@@ -132,6 +130,8 @@ class FilmStore:
 
     def __init__(self, folder: Path | None = None, limit: int = 100_000_000_000) -> None:
         self.folder, self.limit = folder, limit
+        self._noted: dict[str, str] = {}  # by the key of a film; where the user's own folder is not writable
+        self._looked_at: dict[Path, tuple[int, int]] = {}  # size and time of a file that holds what was noted
 
     def resize(self, folder: Path | None, limit: int) -> None:
         """Take this folder, and ``limit`` bytes, from now on.
@@ -149,7 +149,8 @@ class FilmStore:
         path, start = self._path(film), index * film.frame_bytes
         for _ in range(2):
             with suppress(FileNotFoundError):
-                pixels = np.fromfile(path, np.uint8, film.frame_bytes, offset=start)
+                is_held = self._has(film, index + 1)
+                pixels = np.fromfile(path, np.uint8, film.frame_bytes, offset=start) if is_held else ()
                 if len(pixels) == film.frame_bytes:
                     self._use(film)
                     return pixels.reshape(*film.size[::-1], 3)
@@ -186,17 +187,37 @@ class FilmStore:
     def _path(self, film: Film) -> Path:
         return (self.folder or film.path.parent / FOLDER) / f"{film.key}{_SUFFIX}"
 
-    def _has(self, film: Film) -> bool:
-        """Tell whether the frames of a film are there; those of a longer part of it will do."""
+    def _has(self, film: Film, count: int | None = None) -> bool:
+        """Tell whether the first frames of a film are there, None: all, as this user has decoded them."""
         with suppress(OSError):
-            size = self._path(film).stat().st_size
-            return size % film.frame_bytes == 0 and size >= film.frame_bytes * len(film.images)
+            path, least = self._path(film), film.frame_bytes * (count or len(film.images))
+            about = path.lstat()
+            if about.st_size % film.frame_bytes or about.st_size < least or not stat.S_ISREG(about.st_mode):
+                return False
+            if self._looked_at.get(path) != (stamp := _stamp(path)):
+                noted = self._noted.get(film.key) or (read_json(_note_of(film)) or {}).get("sha256")
+                if noted != _digest(path, f"{film.key} {about.st_size}"):
+                    return False
+                self._looked_at[path] = stamp
+            return True
         return False
+
+    def _note(self, film: Film) -> None:
+        """Note what the file of a film holds that was just decoded."""
+        path = self._path(film)
+        digest = _digest(path, f"{film.key} {path.stat().st_size}")
+        self._noted[film.key] = digest
+        with suppress(OSError):
+            write_json(_note_of(film), {"film": str(film.path.resolve()), "sha256": digest})
 
     def _use(self, film: Film) -> None:
         """Note that a film is in use, so that its file makes no room for others."""
         with suppress(OSError):  # not there, or another user's
-            os.utime(self._path(film))
+            path = self._path(film)
+            is_known = self._looked_at.get(path) == _stamp(path)
+            os.utime(path)
+            if is_known:
+                self._looked_at[path] = _stamp(path)
 
     def _write(self, film: Film, progress) -> None:
         path = self._path(film)
@@ -206,17 +227,18 @@ class FilmStore:
             for index, pixels in enumerate(film.decoded(0, len(film.images))):
                 file.write(pixels.data)
                 progress(index + 1)
+        self._note(film)
 
     def _make_room(self, folder: Path, needed: int, names: Sequence[str]) -> None:
         """Remove files that nobody uses where room is lacking; say what will be taken, or refuse."""
-        files = []
+        kept = []
         for path in filter(_is_ours, folder.iterdir()):
             with suppress(FileNotFoundError):  # another process removes some, too
-                files.append((path.stat().st_mtime, path.stat().st_size, path))
-        files.sort()
-        taken = sum(size for _, size, _ in files)
+                kept.append((path.stat().st_mtime, path.stat().st_size, path))
+        kept.sort()
+        taken = sum(size for _, size, _ in kept)
         free = shutil.disk_usage(folder).free - _RESERVE
-        for used, size, path in files:
+        for used, size, path in kept:
             if (taken + needed > self.limit or needed > free) and time.time() - used > _IN_USE_S:
                 path.unlink(missing_ok=True)
                 taken, free = taken - size, free + size
@@ -243,6 +265,25 @@ def films_of(loads: Iterable[object]) -> list[Film]:
         loads: what loads the frames of a scene; what is of no film is left out.
     """
     return list(dict.fromkeys(load.film for load in loads if isinstance(load, FilmImage)))
+
+
+def _stamp(path: Path) -> tuple[int, int]:
+    about = path.stat()
+    return about.st_size, about.st_mtime_ns
+
+
+def _note_of(film: Film) -> Path:
+    return files.own_folder() / "frames" / f"{film.key}.json"
+
+
+def _digest(path: Path, more: str) -> str:
+    """Hash ``more`` and 64 blocks of a file, evenly spread."""
+    digest, size = hashlib.sha256(more.encode()), path.stat().st_size
+    with path.open("rb") as file:
+        for i in range(_BLOCKS):
+            file.seek(i * max(size - _BLOCK, 0) // (_BLOCKS - 1))
+            digest.update(file.read(_BLOCK))
+    return digest.hexdigest()
 
 
 def _opaque(pixels: np.ndarray) -> Tensor:

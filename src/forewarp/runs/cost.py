@@ -28,7 +28,7 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
 from forewarp.data.files import RECORD
-from forewarp.files import read_json, read_rows, written_whole
+from forewarp.files import own_folder, read_json, read_rows, written_whole
 from forewarp.runs.config import hashed, plain
 
 FILE_VARIABLE = "FOREWARP_TIMES"
@@ -129,11 +129,7 @@ def own_file() -> Path:
     """Return the file of this machine's jobs: the one that ``FOREWARP_TIMES`` names, else the user's."""
     if named := os.environ.get(FILE_VARIABLE):
         return Path(named).expanduser()
-    try:
-        cache = Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser()
-    except RuntimeError:  # a user without a home
-        cache = Path(os.devnull)  # in which nothing is read or written
-    return cache / "forewarp" / "times.csv"
+    return own_folder() / "times.csv"
 
 
 def read_costs(file: Path) -> list[Row]:
