@@ -94,6 +94,20 @@ def test_what_cannot_be_read_is_refused(tmp_path):
         read_model(tmp_path / "torn")
 
 
+def test_lengths_in_a_model_are_not_believed_beyond_its_files(tmp_path):
+    write_model(tmp_path / "sparse", cameras_on_arc(3), POINTS)
+    pycolmap.Reconstruction(tmp_path / "sparse").write_binary(tmp_path / "sparse")
+    for file in (tmp_path / "sparse").glob("*.txt"):
+        file.unlink()
+    file = tmp_path / "sparse" / "points3D.bin"
+    content = bytearray(file.read_bytes())
+    at = 8 + 8 + 24 + 3 + 8  # the first point's track
+    content[at : at + 8] = (10**9).to_bytes(8, "little")
+    file.write_bytes(content)
+    with pytest.raises(ValueError, match="sparse: expected a COLMAP model, but got"):
+        read_model(tmp_path / "sparse")
+
+
 def forget(model, image, numbers):
     """Delete what an image sees of some points."""
     for row, point in enumerate(model.images[image].points2D):

@@ -120,6 +120,23 @@ def test_what_is_wrong_in_a_scan_is_told_in_a_line(tmp_path, changes, message):
     assert not (tmp_path / "a").exists()
 
 
+def test_a_small_scan_asks_for_no_more_than_is_said(tmp_path):
+    with zipfile.ZipFile(tmp_path / "a.r3d", "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("metadata", "[" + "[]," * 30_000_000 + "[]]")
+    assert (tmp_path / "a.r3d").stat().st_size < 200_000
+    with pytest.raises(SceneError, match="metadata: expected at most 16777216 bytes, but got 90000004"):
+        captured(tmp_path / "a.r3d", tmp_path / "a")
+
+
+@pytest.mark.slow
+def test_a_plane_that_unpacks_to_gigabytes_is_refused_before_it_does(tmp_path):
+    block = lzfse.compress(bytes(1 << 20))[:-4]  # without the mark of the end
+    bomb = block * 3000 + lzfse.compress(b"")[-4:]
+    changes = {"dw": 1000, "dh": 1000, "rgbd/4.depth": bomb, "rgbd/0.depth": bomb}
+    with pytest.raises(SceneError, match="expected 4000000 bytes as dw and dh say, but got many times"):
+        captured(write_scan(tmp_path / "a.r3d", **changes), tmp_path / "a")
+
+
 def test_another_file_is_no_scan(tmp_path):
     with zipfile.ZipFile(tmp_path / "nested.r3d", "w") as archive:
         archive.writestr("metadata", "[" * 100_000)

@@ -214,6 +214,18 @@ def test_a_scene_of_too_many_frames_is_refused(tmp_path, monkeypatch):
         hypernerf.read_scene(tmp_path, "a")
 
 
+def test_what_all_frames_share_is_bounded(tmp_path):
+    content = {str(key): 0 for key in range(2001)} | {"frames": [{}] * 50_000}
+    with refused("transforms.json: expected at most 2000 keys beside so many frames, but got 2002 keys"):
+        files.frames_of(tmp_path / "transforms.json", content)
+
+
+def test_more_threads_than_a_system_begins_are_refused():
+    assert files.threads_of(256) == 256
+    with refused("threads: expected at most [0-9]+, but got 100000; set threads="):
+        files.threads_of(100_000)
+
+
 def test_pipes_and_devices_are_no_files(tmp_path):
     os.mkfifo(tmp_path / "a.json")
     os.mkfifo(tmp_path / "a.jpg")

@@ -17,6 +17,7 @@ from forewarp.data.cameras import check_lens
 from forewarp.data.directions import inverted, opposite, other_readings
 from forewarp.data.files import SceneError, composed, mismatch
 from forewarp.data.images import by
+from forewarp.files import memory_within
 from forewarp.scene.camera import Camera, Lens
 
 pycolmap.logging.minloglevel = pycolmap.logging.FATAL.value  # print nothing but what ends it
@@ -49,6 +50,7 @@ _READINGS = {  # what else may be in a model
     "their axes are OpenGL's (negate the camera's y and z)": opposite,
 }
 _SAME_PLACE = 1e-6  # of the distance from the origin; models have six digits or more
+_ROOM = 1 << 30  # bytes that reading a model may take beside twenty times its files
 _PLACES = ("", "sparse/0", "sparse", "colmap/sparse/0")  # of a model in a folder that is given
 Pairs = Sequence[tuple[str, str]]  # of images, by their names
 _PARAMETERS = {"f", "fx", "fy", "cx", "cy", "k", "k1", "k2", "k3", "p1", "p2"}
@@ -166,7 +168,9 @@ def read_model(folder: Path, originals: Mapping[str, str] | None = None) -> Reco
         raise mismatch("colmap", expected, folder, "it is often called sparse/0")
     folder = there[0]
     try:
-        model = pycolmap.Reconstruction(folder)
+        most = sum(file.stat().st_size for file in folder.glob("*.*") if file.is_file())
+        with memory_within(_ROOM + 20 * most):  # it believes what a file says of its lengths
+            model = pycolmap.Reconstruction(folder)
     except (RuntimeError, ValueError, IndexError, OverflowError, MemoryError) as error:
         text = (str(error).strip().splitlines() or ["a file that cannot be read"])[-1]
         raise mismatch(folder, "a COLMAP model", text, "export it again") from error

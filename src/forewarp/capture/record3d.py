@@ -24,13 +24,15 @@ from forewarp.data.directions import opposite
 from forewarp.data.files import Entry, mismatch
 from forewarp.data.images import by, read_image
 from forewarp.data.posed_video import PosedShot, write_scene
-from forewarp.files import folder_written_whole, write_json
+from forewarp.files import MOST_FILM, check_size, folder_written_whole, memory_within, write_json
 from forewarp.ops.gaussians import rotations
 from forewarp.scene.camera import Camera
 from forewarp.scene.frame import spread
 
 _MOST_SIDE, _UNITS, _MOST_BYTES = 1e5, (-1e6, 1e6), 200_000_000
 _MOST_DEPTH_SIDE = 2048  # pixels; LiDARs have 256 x 192, cameras of the face 640 x 480
+_METADATA = 1 << 24  # bytes: parsed they take thirty times as many; of a frame about 150
+_ROOM = 1 << 26  # bytes that unpacking a plane may take beside what it holds
 _OVERHEAD = 4096  # bytes, at most, that compressed data are larger by: LZFSE stores blocks that do not shrink
 _SAMPLED, _SMALLER = 16, 2  # depths that tell near and far; how many times smaller the copies are
 _ENDS = ((0.001, 0.75), (0.999, 1.25))  # of near and far: quantile of all depths, and room beside it
@@ -49,6 +51,7 @@ def capture_record3d(scan: Path, out: Path, step: Step, mark: str, frames: int |
     Raises:
         SceneError: in a line, for what is missing or wrong in the archive; ImportError: without ``lzfse``.
     """
+    check_size(scan, MOST_FILM)
     try:
         archive = zipfile.ZipFile(scan)
     except (OSError, zipfile.BadZipFile) as error:
@@ -99,7 +102,7 @@ class _Scan:
     def __init__(self, path: Path, archive: zipfile.ZipFile) -> None:
         self.path, self.archive = path, archive
         try:
-            about = json.loads(self.member("metadata"))
+            about = json.loads(self.member("metadata", _METADATA))
         except (ValueError, RecursionError) as error:  # of its text, too; of absurd nesting
             raise mismatch(f"{path}: metadata", "JSON", str(error)) from error
         if not isinstance(about, dict):
@@ -162,9 +165,13 @@ class _Scan:
         (width, height), where = self.of_depth, f"{self.path}: {name}"
         size = width * height * np.dtype(kind).itemsize
         try:
-            raw = lzfse.decompress(self.member(name, size + _OVERHEAD))
-        except (lzfse.error, MemoryError) as error:  # of lengths that a harmed stream claims
+            packed = self.member(name, size + _OVERHEAD)
+            with memory_within(4 * size + _ROOM):
+                raw = lzfse.decompress(packed)
+        except lzfse.error as error:
             raise mismatch(where, "data compressed by LZFSE", "others") from error
+        except MemoryError as error:
+            raise mismatch(where, f"{size} bytes as dw and dh say", "many times as many") from error
         if len(raw) != size:
             raise mismatch(where, f"{width} x {height} numbers as dw and dh say", f"{len(raw)} bytes")
         return np.frombuffer(raw, kind).reshape(height, width)

@@ -41,7 +41,7 @@ import importlib.util
 from pathlib import Path
 
 from forewarp.cli.entry import command
-from forewarp.data.files import LAYOUTS, one_of, whole
+from forewarp.data.files import LAYOUTS, one_of, threads_of, whole
 from forewarp.files import check_replaceable
 from forewarp.runs.config import check_seed
 from forewarp.runs.overrides import command_line, text_override
@@ -120,9 +120,11 @@ def check(config) -> tuple[dict, object]:
         if path is not None and not there(path):
             got = "another thing" if path.exists() else "none"
             raise ValueError(f"{key}: expected an existing {what}, but got {got}: {path}; set {key}=...")
-    for key, least in (("frames", 3), ("size", 64), ("features", 100), ("threads", 1)):
+    for key, least in (("frames", 3), ("size", 64), ("features", 100)):
         if config[key] is not None or key == "features":
             whole(config[key], key, least)
+    if config.threads is not None:
+        threads_of(config.threads)
     check_seed(config.seed)
     one_of(config.matching, "matching", *MATCHING)
     one_of(config.lens, "lens", *LENSES)

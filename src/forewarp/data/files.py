@@ -22,6 +22,8 @@ from unicodedata import category, normalize
 from forewarp.files import MOST_BYTES, check_size, load_json
 
 MOST_FRAMES = 1_000_000
+_MOST_SHARED = 100_000_000  # keys that all frames of a file share, times frames
+MOST_THREADS = max(256, os.cpu_count() or 1)  # beyond, libraries fail without a word
 LAYOUTS = {  # what people call a layout: a file or folder that every scene of it has, and what reads it
     "HyperNeRF": ("dataset.json", "experiment=hypernerf"),
     "NHR": ("CamPose.inf", "experiment=nhr"),
@@ -173,6 +175,13 @@ def whole(value: object, where: str, least: int, multiple: int = 1) -> int:
         kind = "a whole number" if multiple == 1 else f"a multiple of {multiple}"
         raise mismatch(where, f"{kind} of at least {least}", short(value), f"set {where}=...")
     return int(value)
+
+
+def threads_of(value: object, where: str = "threads") -> int:
+    """Check a number of threads that a system can begin; ``where`` names the key to set."""
+    if (count := whole(value, where, 1)) > MOST_THREADS:
+        raise mismatch(where, f"at most {MOST_THREADS}", count, f"set {where}={os.cpu_count()}")
+    return count
 
 
 def numbers_of(words: list[str], count: int, where: str) -> list[float]:
@@ -335,6 +344,9 @@ def frames_of(file: Path, content: dict) -> list[Entry]:
         if not isinstance(frame, dict):
             raise mismatch(f"{where}[{i}]", "an object", short(frame))
     common = stated(content)
+    if len(common) * len(frames) > _MOST_SHARED:  # each frame is looked at with all of them
+        most, got = _MOST_SHARED // len(frames), f"{len(common)} keys beside {len(frames)} frames"
+        raise mismatch(file, f"at most {most} keys beside so many frames", got, "remove what is not needed")
     return [Entry(file, stated(frame), f"frames[{i}].", common) for i, frame in enumerate(frames)]
 
 

@@ -73,7 +73,7 @@ def words_of(name: str) -> list[str]:
     >>> words_of("preset.rays=64 stage.fine.num_voxels=[[0, 8000]] ~stage.coarse")
     ['preset.rays=64', 'stage.fine.num_voxels=[[0,8000]]', '~stage.coarse']
     """
-    return [re.sub(r"\s", "", part) for part in re.split(r"\s+(?=[+~]|[\w./]+=)", name) if part]
+    return [re.sub(r"\s", "", part) for part in re.split(r"(?<!\s)\s+(?=[+~]|[\w./]+=)", name) if part]
 
 
 def counts(key: str) -> bool:

@@ -19,7 +19,7 @@ from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from omegaconf import DictConfig, OmegaConf
 
 from forewarp.clock import Clock
-from forewarp.data.files import mismatch, one_of, whole
+from forewarp.data.files import mismatch, one_of, threads_of
 from forewarp.data.films import FOLDER
 from forewarp.evaluation.curves import AccuracyCurve
 from forewarp.provenance import RESULTS
@@ -80,7 +80,7 @@ def build_run(config: DictConfig) -> Run:
         ValueError: naming the wrong key of the config.
     """
     if config.threads is not None:
-        torch.set_num_threads(whole(config.threads, "threads", 1))
+        torch.set_num_threads(threads_of(config.threads))
     check_trainer(config.trainer)
     device = partial(device_for, config)
     data = instantiate(config.data, _convert_="all")
