@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import os
 import platform
 import subprocess
+import sys
 from contextlib import suppress
 from functools import cache
 from importlib.metadata import (
@@ -19,6 +21,14 @@ from pathlib import Path
 
 RESULTS = ("torch", "lightning", "hydra-core", "numpy", "numba", "torchmetrics")  # what results depend on
 NUMBERS = ("conf", "sweeps")  # folders beside a checkout's src that count as code
+
+
+def import_nothing_from_here() -> None:
+    """Let processes that this one starts import nothing from the folder in which one works, where a file may
+    be called as a module of Python. Python 3.10 knows no such word: there what a process imports first is.
+    """
+    os.environ["PYTHONSAFEPATH"] = "1"
+    sys.path[:] = [place for place in sys.path if place]
 
 
 @cache

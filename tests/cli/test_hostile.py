@@ -2,6 +2,8 @@
 
 import os
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -125,6 +127,32 @@ def test_a_file_is_not_written_through_a_link_that_lies_in_wait(in_tmp, monkeypa
     replace_file(Path("page.md"), "x")
     assert not Path("page.md").is_symlink()  # the link is replaced, not followed
     assert Path("secret").read_text() == SECRET
+
+
+COMMAND = """
+if __name__ == "__main__":
+    from forewarp.cli.entry import quiet
+    quiet()
+    import subprocess, sys
+    from concurrent.futures import ProcessPoolExecutor
+    from multiprocessing import get_context
+    with ProcessPoolExecutor(1, get_context("spawn")) as pool:
+        print(pool.submit(abs, -3).result())
+    print(subprocess.run([sys.executable, "-m", "pickle", "-h"], capture_output=True).returncode)
+"""
+
+
+def test_no_process_that_is_started_imports_of_the_current_folder(in_tmp):
+    """Neither what begins workers nor what they import; in a process of its own, as commands are."""
+    if sys.version_info < (3, 11):
+        pytest.skip("Python 3.10 knows no PYTHONSAFEPATH")
+    for name in ("multiprocessing", "pickle", "numpy", "joblib"):
+        Path(f"{name}.py").write_text("open('trace', 'w')\nraise SystemExit(3)\n")
+    Path("bin").mkdir()
+    Path("bin/command.py").write_text(COMMAND)  # whose folder is the first to import from
+    done = subprocess.run([sys.executable, "bin/command.py"], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["3", "0"]
+    assert not os.path.exists("trace")
 
 
 @pytest.mark.slow

@@ -20,6 +20,8 @@ from pathlib import Path
 import forewarp
 from forewarp.cli.mistakes import flat, one_line, options_last, refuse_dashes, unknown_key, with_run_key
 from forewarp.interrupts import listening, signal_of
+from forewarp.progress import printable_output
+from forewarp.provenance import import_nothing_from_here
 from forewarp.runs import overrides
 from forewarp.runs.config_files import configurations, installed, project_root
 from forewarp.runs.overrides import as_text, command_of_job, is_sweep, key_of
@@ -31,6 +33,7 @@ INTERRUPTED = 128  # and the number of the signal
 _MMAP_THRESHOLD, _TRIM_THRESHOLD = -3, -1  # of mallopt, in glibc's malloc.h
 
 
+@printable_output()
 def command(name: str, task: Callable, text: str, *, config: str | None = None) -> None:
     """Run a console script: compose ``conf/<config>.yaml`` with the command line and call ``task`` with it.
 
@@ -111,6 +114,7 @@ def quiet() -> None:
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # Ray would report usage to its makers
     drop_launchers()
+    import_nothing_from_here()
     # Lets Hydra raise errors instead of printing them.
     os.environ["HYDRA_FULL_ERROR"] = "1"
     logging.disable(logging.INFO)
@@ -166,6 +170,7 @@ def _run(name: str, task: Callable, conf: Path, config_name: str) -> list[int]:
     overrides.constant.clear()  # of an earlier sweep of this process
     overrides.constant.update(typed_once)
 
+    @printable_output()
     def job(config) -> object:
         status, result = 0, None
         try:

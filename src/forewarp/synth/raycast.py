@@ -18,6 +18,7 @@ import numpy as np
 import torch
 
 from forewarp.ops.backend import cores
+from forewarp.provenance import import_nothing_from_here
 from forewarp.scene.camera import Camera
 from forewarp.synth.shapes import Surface, color_of
 from forewarp.synth.world import LIGHT_AT, World
@@ -287,6 +288,7 @@ def by_processes(function: Callable, jobs: Iterable[tuple], samples: float, work
     if workers == 1:
         yield from (function(*job) for job in jobs)
         return
+    import_nothing_from_here()
     pool, waiting = ProcessPoolExecutor(workers, get_context("spawn"), _begin), deque()
     try:
         for job in jobs:
@@ -301,6 +303,7 @@ def by_processes(function: Callable, jobs: Iterable[tuple], samples: float, work
 
 def _begin() -> None:
     """Set up a new process: leave Ctrl-C to the parent, and use one thread."""
+    import_nothing_from_here()
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     torch.set_num_threads(1)
 
