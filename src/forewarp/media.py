@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from PIL import Image
 
 MOST_PIXELS = 80_000_000  # of an image and of a film's frame; Pillow warns a little above
+MOST_DRAWN = 40_000_000  # pixels of an image that a run has drawn, which is read as float32
 FORMATS = ("PNG", "JPEG")
 # ffmpeg's readers of films; others, such as those of playlists, open more than the file.
 _CONTAINERS = (
@@ -31,11 +32,11 @@ class TooManyPixels(ValueError):
     """An image has none, or more than ``MOST_PIXELS``."""
 
 
-def open_image(stream: BinaryIO) -> Image.Image:
+def open_image(stream: BinaryIO, most: int = MOST_PIXELS) -> Image.Image:
     """Open a PNG or JPEG, and decode nothing yet.
 
     Raises:
-        TooManyPixels: for none or more than ``MOST_PIXELS``.
+        TooManyPixels: for none or more than ``most``.
         PIL.UnidentifiedImageError: for another kind of file.
         OSError, SyntaxError, ValueError: for a harmed one, as Pillow raises them.
     """
@@ -49,7 +50,7 @@ def open_image(stream: BinaryIO) -> Image.Image:
         raise TooManyPixels("more") from error
     if not image.tile:
         raise UnidentifiedImageError
-    if not 0 < image.width * image.height <= MOST_PIXELS:
+    if not 0 < image.width * image.height <= most:
         raise TooManyPixels(f"{image.width} x {image.height}")
     return image
 
@@ -59,7 +60,7 @@ def read_rgb(path: Path) -> np.ndarray:
 
     Raises:
         OSError: where it cannot be read.
-        ValueError: naming the file, for anything else than such an image of at most ``MOST_PIXELS``.
+        ValueError: naming the file, for anything else than such an image of at most ``MOST_DRAWN`` pixels.
     """
     return _decoded(path, read_bytes(path, MOST_IMAGE))
 
@@ -79,9 +80,9 @@ def image_bytes(path: Path) -> bytes:
 
 def _decoded(path: Path, content: bytes) -> np.ndarray:
     try:
-        return np.array(open_image(io.BytesIO(content)).convert("RGB"))
+        return np.array(open_image(io.BytesIO(content), MOST_DRAWN).convert("RGB"))
     except TooManyPixels as error:
-        expected = f"an image of 1 to {MOST_PIXELS} pixels"
+        expected = f"an image of 1 to {MOST_DRAWN} pixels"
         raise ValueError(f"{path}: expected {expected}, but got {error}") from error
     except Exception as error:  # decoders raise OSError, SyntaxError, struct.error and more
         got = f"another file ({error})" if str(error) else "another file"

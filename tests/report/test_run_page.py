@@ -4,6 +4,7 @@ import json
 import os
 import re
 import shutil
+import struct
 from html.parser import HTMLParser
 
 import pytest
@@ -117,6 +118,15 @@ def as_link(path):
     path.symlink_to("/etc/passwd")
 
 
+def _event(content):
+    """Write a record as TensorBoard does."""
+    from tensorboard.compat.tensorflow_stub.pywrap_tensorflow import masked_crc32c
+
+    length = struct.pack("<Q", len(content))
+    sums = (struct.pack("<I", masked_crc32c(part)) for part in (length, content))
+    return length + next(sums) + content + next(sums)
+
+
 BAD = {  # what lies in a run's folder -> how it is made, and what the refusal says
     "videos/both.mp4": (as_link, "both.mp4: expected no links inside a run's folder"),
     "images/sheets/a.png": (as_link, "a.png: expected no links inside a run's folder"),
@@ -133,6 +143,17 @@ def test_what_lies_in_the_folder_of_a_stranger_is_refused_before_it_is_read(tmp_
     make, said = BAD[name]
     make(folder / name)
     with pytest.raises(ValueError, match=said):
+        read_story(folder)
+
+
+def test_events_that_are_none_are_refused_in_a_line(tmp_path):
+    folder = told_run(tmp_path, views=0)
+    (folder / "tensorboard").mkdir()
+    length = b"\xff" * 8
+    (folder / "tensorboard" / "events.out.tfevents.1").write_bytes(length + b"\0" * 4)
+    assert read_story(folder)["loss"] == {}  # torn, as of a killed run
+    (folder / "tensorboard" / "events.out.tfevents.1").write_bytes(_event(b"\xff\xff\xff"))
+    with pytest.raises(ValueError, match="tensorboard: expected events of TensorBoard, but got others"):
         read_story(folder)
 
 

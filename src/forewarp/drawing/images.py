@@ -260,7 +260,7 @@ def image_size(path: Path) -> tuple[int, int]:
 
 def read_image(path: Path) -> Tensor:
     """Read a PNG or JPEG as (H, W, 3) in [0, 1]; alpha is dropped. Raises as ``media.read_rgb``."""
-    return torch.from_numpy(read_rgb(path)).float() / 255
+    return torch.from_numpy(read_rgb(path)).float().div_(255)
 
 
 def video_within(path: Path, most: int) -> tuple[bytes, str]:

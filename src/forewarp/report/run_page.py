@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 
 from markupsafe import Markup, escape
 
-from forewarp.files import read_rows, replace_file, write_json
+from forewarp.files import MOST_ARRAYS, check_size, read_rows, replace_file, write_json
 from forewarp.metrics.registry import metric_of
 from forewarp.progress import time_text
 from forewarp.report.choices import seconds_to
@@ -151,7 +151,13 @@ def _loss(run: Path) -> list[tuple[int, float]]:
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
     kept = {"scalars": 0, "images": 1, "tensors": 1, "histograms": 1, "audio": 1, "compressedHistograms": 1}
-    events = EventAccumulator(str(folder), size_guidance=kept).Reload()
+    for file in folder.rglob("*tfevents*"):
+        check_size(file, MOST_ARRAYS)
+    try:
+        events = EventAccumulator(str(folder), size_guidance=kept).Reload()
+    except Exception as error:  # of protobuf's and TensorBoard's own kinds
+        got = f"others ({type(error).__name__}); delete the folder"
+        raise ValueError(f"{folder}: expected events of TensorBoard, but got {got}") from error
     found = events.Scalars("train/loss") if "train/loss" in events.Tags()["scalars"] else []
     return sorted({event.step: event.value for event in found if math.isfinite(event.value)}.items())
 
