@@ -32,6 +32,7 @@ MOST_POINTS = 1 << 28  # of a cloud of points as text
 MOST_IMAGE = 1 << 29
 MOST_FILM = MOST_ARCHIVE = 1 << 40
 MOST_ARRAYS = 1 << 30  # of NumPy's files, also when unpacked
+MOST_COMMAND = 1 << 16  # characters of a command, as splitting it takes time that grows by the square
 MOST_LEVELS = 40  # of YAML, one within the other
 
 _FULL = errno.ENOSPC, errno.EDQUOT, errno.EFBIG  # what a full disk says
@@ -254,6 +255,13 @@ def load_json(path: Path, top: type = dict) -> dict | list:
         kind = "object" if top is dict else top.__name__
         raise ValueError(f"{path}: expected a JSON {kind} at the top, but got {type(content).__name__}")
     return content
+
+
+def check_command(command: object, where: object) -> None:
+    """Refuse a command, of a run's config, that is no text or longer than ``MOST_COMMAND``."""
+    if command is not None and not (isinstance(command, str) and len(command) <= MOST_COMMAND):
+        got = f"{len(command)}" if isinstance(command, str) else short(command)
+        raise ValueError(f"{where}: expected a text of at most {MOST_COMMAND} characters, but got {got}")
 
 
 class _PlainLoader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):

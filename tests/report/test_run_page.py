@@ -132,6 +132,10 @@ BAD = {  # what lies in a run's folder -> how it is made, and what the refusal s
     "images/sheets/a.png": (as_link, "a.png: expected no links inside a run's folder"),
     "metrics.json": (as_link, "metrics.json: expected no links inside a run's folder"),
     "tensorboard/events.out.tfevents.1": (os.mkfifo, "expected a file, but got a device or a pipe"),
+    "config.yaml": (
+        lambda path: path.write_text(f"command: {'x' * 70000}"),
+        "command: expected a text of at",
+    ),
     "plan.yaml": (lambda path: path.write_text("a: &a [1]\nb: [*a, *a]"), "expected no aliases"),
 }
 

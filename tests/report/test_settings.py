@@ -3,6 +3,7 @@
 import os
 import re
 import shlex
+import time
 
 import pytest
 import yaml
@@ -11,7 +12,7 @@ from forewarp.report.benchmark import write_methods, write_minutes
 from forewarp.report.choices import write_accuracy_time, write_effects, write_price_list
 from forewarp.report.paper import write_ablation, write_paper
 from forewarp.report.results import read_runs
-from forewarp.report.settings import NOT_COUNTED, configuration, typed
+from forewarp.report.settings import NOT_COUNTED, configuration, typed, words_of
 from tests.support.configs import ROOT
 from tests.support.runs_on_disk import rows_of, write_run
 
@@ -183,3 +184,9 @@ def test_what_a_plan_leaves_alone_tells_planned_runs_apart(tmp_path):
 @pytest.mark.parametrize("word", ["", " ", "~stage.coarse"])
 def test_an_empty_word_of_a_command_sets_nothing(word):
     assert [*typed(shlex.join(["forewarp-train", word, "seed=0"])).values()] == [word] * (word[:1] == "~")
+
+
+def test_a_command_of_many_spaces_is_split_in_a_moment():
+    began = time.perf_counter()
+    assert words_of("a=1" + " " * 300_000 + "b") == ["a=1b"]
+    assert time.perf_counter() - began < 5

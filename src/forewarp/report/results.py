@@ -21,7 +21,15 @@ from itertools import chain
 from pathlib import Path
 from typing import NamedTuple
 
-from forewarp.files import load_json, load_yaml, read_json, read_rows, refuse_links, replace_file
+from forewarp.files import (
+    check_command,
+    load_json,
+    load_yaml,
+    read_json,
+    read_rows,
+    refuse_links,
+    replace_file,
+)
 from forewarp.metrics.registry import described_own, metric_of, take_described
 from forewarp.outline import check_outline
 from forewarp.report.settings import (
@@ -286,6 +294,7 @@ def read_run(folder: Path) -> Row:
     """
     refuse_links(folder)
     config = load_yaml(folder / "config.yaml")
+    check_command(config.get("command"), f"{folder / 'config.yaml'}: command")
     check_outline(config, f"{folder / 'config.yaml'}: ")
     stages = {file.parent.name: load_json(file) for file in sorted(folder.glob("*/done.json"))}
     metrics = load_json(folder / "metrics.json") if (folder / "metrics.json").is_file() else {}

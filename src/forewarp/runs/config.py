@@ -25,7 +25,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from forewarp.data.files import RECORD, mismatch, number, one_of
-from forewarp.files import MOST_CONFIG, check_yaml, read_text, refuse_links
+from forewarp.files import MOST_CONFIG, check_command, check_yaml, read_text, refuse_links
 from forewarp.outline import check_outline
 from forewarp.runs.overrides import constant, key_of, typed_overrides
 
@@ -257,6 +257,7 @@ def check_values(config: DictConfig) -> None:
         if not OmegaConf.is_dict(config.get(key)):
             raise ValueError(f"{key}: expected keys of its own, but got {config.get(key)!r:.80}")
     number(config.get("checkpoint_seconds"), "checkpoint_seconds", 0)
+    check_command(config.get("command"), "command")
     for key in ("seed", "data.seed", "data.synthesis.seed"):
         if key == "seed" or OmegaConf.select(config, key) is not None:
             check_seed(OmegaConf.select(config, key), key)
