@@ -60,7 +60,7 @@ REFUSED = [
     (["export"], "run: expected the folder of a run, but got nothing"),
     (["export", "run=."], "config.yaml: expected the configuration of a run, but got none"),
     (["report", "kind=run", "run=a"], "config.yaml: expected the configuration of a run, but got none"),
-    (["report"], "runs/accuracy_time: expected folders of runs, but got none"),
+    (["report", "kind=paper"], "expected a folder with runs, but got runs/paper, which is not there"),
     (["capture"], "expected video=FILE, videos=FOLDER or images=FOLDER, but got none"),
     (["data", "check"], "expected check SCENES, but got check"),
     (

@@ -37,7 +37,7 @@ def test_the_help_has_a_line_for_each_kind(forewarp):
             f"kind: expected {KINDS.replace(', run', ' or run')}, but got",
         ),
         (["target=high"], "target: expected a number of dB or null, but got 'high'"),
-        ([], "runs/accuracy_time: expected folders of runs, but got none"),
+        (["kind=minutes"], "runs: expected a folder with runs, but got runs/minutes, which is not there"),
         (["published=none.yaml"], "none.yaml: expected a usable file or folder, but got No such file"),
         (["kind=paper", "runs=[a,b]"], "runs: expected one folder for kind=paper, but got a list"),
         (["kind=compare"], "runs: expected folders of runs, but got none; set runs="),

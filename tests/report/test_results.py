@@ -64,8 +64,14 @@ def test_folders_without_results_are_named_and_the_others_read(tmp_path):
     assert found["wide"].endswith("config.yaml: expected at most 1048576 bytes, but got 1048577)")
     assert "line 1: expected JSON, but got Expecting" in found["empty"]
     assert [name for name, line in found.items() if "cannot be read (" not in line] == []
-    with pytest.raises(ValueError, match="expected folders of runs, but got none; make some with"):
+    (tmp_path / "none").mkdir()
+    with pytest.raises(ValueError, match="none: expected folders of runs, but got none; make some with"):
         read_runs(tmp_path / "none")
+    with pytest.raises(ValueError, match="but got .*/nowhere, which is not there; make some with"):
+        read_runs(tmp_path / "nowhere")
+    (tmp_path / "page.md").touch()
+    with pytest.raises(ValueError, match="but got .*/page.md, a file; make some with"):
+        read_runs(tmp_path / "page.md")
 
 
 def test_debug_runs_are_counted_and_left_out(tmp_path):

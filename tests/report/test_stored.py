@@ -86,9 +86,9 @@ def test_a_page_is_the_same_from_its_table(tmp_path, table):
 
 def test_a_table_of_something_else_is_refused_in_one_line(tmp_path):
     (tmp_path / "other.csv").write_text("a,b\n1,2\n")
-    for name in ("other.csv", "none.csv"):
-        with pytest.raises(ValueError, match=f"runs: expected a CSV file of a page, .* but got .*{name}"):
-            write_effects(tmp_path / name, tmp_path)
+    for name in ("other.csv; name a folder", "none.csv, which is not there"):
+        with pytest.raises(ValueError, match=f"runs: expected a CSV file of a page, .*but got .*{name}"):
+            write_effects(tmp_path / name[: name.index(".csv") + 4], tmp_path)
 
 
 @pytest.mark.parametrize("table", ["price-list.csv", "forward.csv", "methods.csv"])

@@ -201,9 +201,13 @@ def read_runs(root: Path, needed: Sequence[str] = ("metrics.json",)) -> tuple[Ru
         for debugging.
 
     Raises:
-        ValueError: if there is no run at all.
+        ValueError: if the folder is not there, or there is no run at all.
     """
     runs, left_out, debugging = Runs(), [], 0
+    do = "make some with forewarp-train, or set runs=..."
+    if not Path(root).is_dir():
+        got = "a file" if Path(root).exists() else "which is not there"
+        raise ValueError(f"runs: expected a folder with runs, but got {root}, {got}; {do}")
     for folder in sorted(path.parent for path in Path(root).rglob("config.yaml")):
         if folder.name == "still" and (folder.parent / "plan.yaml").is_file():
             continue
@@ -225,7 +229,6 @@ def read_runs(root: Path, needed: Sequence[str] = ("metrics.json",)) -> tuple[Ru
             runs.append(row)
     left_out += [f"left out: debug runs: {debugging}"] if debugging else []
     if not runs and not left_out:
-        do = "make some with forewarp-train, or set runs=..."
         raise ValueError(f"{root}: expected folders of runs, but got none; {do}")
     name_settings(runs)
     return _without_repeated(runs, left_out, root)

@@ -28,7 +28,13 @@ OF_KIND = "test "  # begins the column of a score of a kind of test view, as in 
 
 
 def is_stored(path: Path) -> bool:
-    """Whether a path names a CSV file of runs in place of a folder with runs."""
+    """Whether a path names a CSV file of runs in place of a folder with runs.
+
+    Raises:
+        ValueError: if the file is not there.
+    """
+    if path.suffix == ".csv" and not path.exists():
+        raise ValueError(f"runs: expected a CSV file of a page, but got {path}, which is not there")
     return path.suffix == ".csv"
 
 
