@@ -29,6 +29,17 @@ def test_the_help_has_a_line_for_each_kind(forewarp):
         assert len([line for line in text.splitlines() if line.split()[:1] == [f"kind={kind}"]]) == 1
 
 
+def test_without_a_kind_nothing_is_written_but_the_help(forewarp, in_tmp):
+    write_run("runs/accuracy_time")
+    done = forewarp("report")
+    assert done.status == 2
+    assert "kind=accuracy_time" in done.out
+    assert forewarp("report", "--help").out.startswith(done.out)
+    told = "kind: expected the kind of page, but got nothing; type kind=NAME"
+    assert done.err == f"forewarp-report: error: {told}, one of the above\n"
+    assert not (in_tmp / "runs/accuracy_time/results").exists()
+
+
 @pytest.mark.parametrize(
     ("arguments", "line"),
     [
@@ -36,9 +47,10 @@ def test_the_help_has_a_line_for_each_kind(forewarp):
             ["kind=prices"],
             f"kind: expected {KINDS.replace(', run', ' or run')}, but got",
         ),
-        (["target=high"], "target: expected a number of dB or null, but got 'high'"),
+        (["runs=runs"], "kind: expected the kind of page, but got nothing; type kind=NAME"),
+        (["kind=table", "target=high"], "target: expected a number of dB or null, but got 'high'"),
         (["kind=minutes"], "runs: expected a folder with runs, but got runs/minutes, which is not there"),
-        (["published=none.yaml"], "none.yaml: expected a usable file or folder, but got No such file"),
+        (["kind=minutes", "published=none.yaml"], "none.yaml: expected a usable file or folder, but got No"),
         (["kind=paper", "runs=[a,b]"], "runs: expected one folder for kind=paper, but got a list"),
         (["kind=compare"], "runs: expected folders of runs, but got none; set runs="),
     ],

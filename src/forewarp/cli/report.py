@@ -73,7 +73,11 @@ MOST_VIEWS = 64  # of which pixels are looked at
 
 
 def report(config: DictConfig) -> None:
-    """Write the page, or print the table."""
+    """Write the page, or print the table; without a kind print the help."""
+    if config.kind is None:
+        print(__doc__.strip())
+        asked = "expected the kind of page, but got nothing; type kind=NAME, one of the above"
+        raise ValueError(f"kind: {asked}")
     one_of(config.kind, "kind", *KINDS, "table", "compare", "run")
     if not isinstance(config.target, int | float | None):
         raise ValueError(f"target: expected a number of dB or null, but got '{config.target}'")
