@@ -38,9 +38,11 @@ def test_a_multirun_is_a_table_with_intervals(tmp_path):
         "a cpu, 2 threads",
         "background white",
         "fast",
+        "The best of a column is bold, the second underlined; ties share a mark.",
     ):
         assert words in text.split("\n|")[0]
     assert "No run has lpips." in text
+    assert "The best of a column is bold, the second underlined" in (tmp_path / "table.tex").read_text()
     found = list(csv.DictReader((tmp_path / "table.csv").read_text().splitlines()))
     numbers = [[float(row[f"ball PSNR (dB)↑{part}"]) for part in ("", " ci95", " n")] for row in found]
     assert numbers[0] == pytest.approx([30.1667, 2.5856, 3], abs=1e-4)

@@ -25,7 +25,7 @@ from forewarp.report.results import KINDS, Point, Row, Runs, nothing, refused
 from forewarp.report.settings import grouped
 from forewarp.report.statistics import INTERVALS, LEAST, Estimate, by_chance, paired_change, rank, verdict
 from forewarp.report.stored import UNPAIRED, read_any, stored_csv
-from forewarp.report.tables import Cell, Column, Difference, Section, Table, rendered
+from forewarp.report.tables import MARKED, Cell, Column, Difference, Section, Table, rendered
 
 PAPER = Path(__file__).with_name("paper.yaml")  # the printed numbers
 # What the runs of one row of a table have in common.
@@ -250,8 +250,9 @@ def comparison(table: PaperTable, runs: Runs, numbers: Mapping[str, int] | None 
                 lines.append(["", *[""] * len(typed), "difference to the paper", *differences, *no_costs])
     columns = ["method", *typed, "kind", *(_column(*column) for column in table.columns), *COSTS]
     rules = [rule for rule in rules if rule]
-    caption = " ".join(filter(None, [TYPES * len(typed), _caption(lines)]))
-    return Table(columns, lines, caption, _marks(places, table, 2 + len(typed)), rules)
+    marks = _marks(places, table, 2 + len(typed))
+    caption = " ".join(filter(None, [TYPES * len(typed), _caption(lines, marks)]))
+    return Table(columns, lines, caption, marks, rules)
 
 
 def stand_in(table: PaperTable, runs: Runs, numbers: Mapping[str, int] | None = None) -> Table | None:
@@ -276,8 +277,8 @@ def stand_in(table: PaperTable, runs: Runs, numbers: Mapping[str, int] | None = 
     typed = ["type"] * len(table.type_of(None))
     columns = ["measured", *typed, *(_column(*column) for column in made.columns), *COSTS, "published as"]
     columns += [f"published: {group.name} PSNR" for group in shown]
-    caption = " ".join(filter(None, [TYPES * len(typed), _caption(lines)]))
     marks = _marks(dict(enumerate(found)), made, 1 + len(typed))
+    caption = " ".join(filter(None, [TYPES * len(typed), _caption(lines, marks)]))
     return Table(columns, lines, caption, marks).filled()
 
 
@@ -363,10 +364,10 @@ def _marks(found: Mapping[int, Runs], table: PaperTable, first: int) -> dict:
     return marks
 
 
-def _caption(lines: Sequence[Sequence[Cell]]) -> str:
-    """Say what stands beside means, where there are any of several seeds."""
+def _caption(lines: Sequence[Sequence[Cell]], marks: Mapping) -> str:
+    """Say what stands beside means, where there are any of several seeds, and what marks mean."""
     several = any(isinstance(cell, Estimate) and cell.count > 1 for line in lines for cell in line)
-    return f"{INTERVALS}." if several else ""
+    return " ".join([f"{INTERVALS}."] * several + [MARKED] * bool(marks))
 
 
 def write_paper(

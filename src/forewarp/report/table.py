@@ -15,7 +15,7 @@ from forewarp.report.figures import figure_of, pareto_front, save
 from forewarp.report.results import Row, Runs, length, nothing, read_folders, score_of
 from forewarp.report.settings import CONDITIONS, grouped, key_of, value_text
 from forewarp.report.statistics import INTERVALS, Estimate, rank
-from forewarp.report.tables import Column, Table, rendered
+from forewarp.report.tables import MARKED, Column, Table, rendered
 
 # What rows and columns may be of, beside keys of config.yaml: name -> column of a row of ``results``.
 FIELDS = {"model": "method", "method": "method", "preset": "preset", "scene": "scene", "dataset": "dataset"}
@@ -263,8 +263,7 @@ def caption(runs: Runs, cells: Mapping) -> str:
         parts["scores"] += f" (metric={others[0]}/psnr: those of kind {others[0]})" if others else ""
     parts |= {"images": "; ".join(dict.fromkeys(filter(None, (row["pictures"] for row in runs))))}
     conditions = "; ".join(f"{name}: {text}" for name, text in parts.items() if text)
-    marks = " The best of a column is bold, the second underlined; ties share a mark."
-    marked = marks if max(counts) >= 3 else ""
+    marked = "" if max(counts) < 3 else f" {MARKED}"
     return f"{first}. {conditions[:1].upper()}{conditions[1:]}.{marked}"
 
 

@@ -26,6 +26,8 @@ MARKS = {
     "html": {"best": Markup("<b>{}</b>"), "second": Markup("<u>{}</u>")},  # these escape what they hold
     "tex": {"best": "\\textbf{{{}}}", "second": "\\underline{{{}}}"},
 }
+# Pages say what marks mean.
+MARKED = "The best of a column is bold, the second underlined; ties share a mark."
 _LATEX = {c: "\\" + c for c in "&%$#_{}"}
 _LATEX |= {"²": "$^2$", "\\": r"\textbackslash{}", "^": r"\textasciicircum{}"}
 _LATEX |= {"±": r"$\pm$", "δ": r"$\delta$", "<": "$<$", ">": "$>$", "↑": r"$\uparrow$", "↓": r"$\downarrow$"}
