@@ -155,6 +155,20 @@ def test_scenes_and_minutes_stand_apart_and_the_page_is_named_after_most_runs(tm
     assert "Of test views between the training times:" in text
 
 
+def test_a_price_list_says_what_is_true_of_its_runs(tmp_path):
+    for seed, seconds in enumerate((0.005, 0.008, 0.008)):
+        cost = {"seconds": {"train": 50.0, "render_per_frame": seconds}}
+        write_run(tmp_path / "runs", "base", seed, metrics=cost)
+    text = write_price_list(tmp_path / "runs", tmp_path)[0].read_text()
+    # A deviation of 0.001732, times 4.303 / sqrt(3).
+    assert "0.00700 ± 0.00430" in rows_of(text, "base")[0]
+    assert "kind=price_list`. Runs have equal minutes of training, so unequal steps. Metrics" in text
+    assert "shows no difference; its ends say how large one may be" in text
+    write_run(tmp_path / "steps", minutes=None)
+    text = write_price_list(tmp_path / "steps", tmp_path)[0].read_text()
+    assert "Written by `forewarp-report kind=price_list`. Metrics" in text
+
+
 def write_choice(root, choice, *, scene="ball", seed=0, on=(), psnr=30.0, model="forward"):
     """A run of a choice; of ``auto`` with its plan."""
     more = {"scene": scene, "psnr": psnr, "against": "base"}

@@ -429,7 +429,7 @@ def _reached(runs: Runs, others: Runs) -> Table:
     """List all numbers of the runs of a scene that may be compared, the best PSNR first."""
     groups = sorted(runs.by("name").values(), key=lambda group: -(group.mean("psnr") or 0.0))
     columns = {"title": "method", "seeds": Column("seeds", 0)} | score_columns(others.scores())
-    costs = COSTS | {"step": Column("s a step", 3), "frame": Column("s a frame")}
+    costs = COSTS | {"step": Column("s a step", None), "frame": Column("s a frame", None)}
     names = ("steps", "step", "frame", "parameters", "memory")
     columns |= {name: replace(costs[name], spread=False) for name in names}
     measured = sorted({row["measured"] for row in runs if row["measured"]})

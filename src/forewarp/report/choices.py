@@ -25,7 +25,7 @@ from forewarp.report.statistics import FACTORS, INTERVALS, Estimate, by_chance, 
 from forewarp.report.stored import read_any, stored_csv
 from forewarp.report.tables import Column, Table, rendered, score_columns
 
-COSTS = {"epe": Column("EPE", 4), "step": Column("s/step", 3), "frame": Column("s/frame")}
+COSTS = {"epe": Column("EPE", 4), "step": Column("s/step", None), "frame": Column("s/frame", None)}
 COSTS |= {"memory": Column("GiB"), "parameters": Column("parameters (M)", 3), "steps": Column("steps", 0)}
 CHOICES = {"auto": "planned", "base": "the preset", "all_effects": "every effect", "no_effects": "none"}
 
@@ -158,6 +158,7 @@ def write_price_list(folder: Path, out: Path) -> list[Path]:
     model = mode([row["method"] for row in runs] or ["forward"])
     page = out / ("price-list.md" if model == "forward" else f"price-list-{model}.md")
     about = {"machine": runs.machines(), "left_out": left_out}
+    about["equal_minutes"] = all(runs.by("minutes"))  # None: steps alone bound them
     replace_file(page, rendered("price_list.md.j2", scenes=scenes, **about))
     replace_file(page.with_suffix(".csv"), stored_csv(runs))
     return [page, page.with_suffix(".csv")]

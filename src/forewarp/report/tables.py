@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import csv
 import io
+import math
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -49,8 +50,9 @@ Cell = Estimate | float | int | str | None
 class Column:
     """A column's title and number format.
 
-    ``digits`` after the point, None: as many as a number has, at most four that count; ``prefix`` stands
-    before numbers; ``spread``: show after a mean what ``statistics.INTERVALS`` says.
+    ``digits`` after the point, None: as many as a number has, at most four that count, of a mean as many as
+    its first three that count need; ``prefix`` stands before numbers; ``spread``: show after a
+    mean what ``statistics.INTERVALS`` says.
     """
 
     name: str
@@ -68,10 +70,15 @@ class Column:
         '×1.59 (×0.59 to ×4.29)'
         >>> [Column("minutes", None).text(minutes) for minutes in (0.05, 1.0, 20.0)]
         ['0.05', '1', '20']
+        >>> [Column("s/frame", None).text(Estimate(mean, 0.0016, 3)) for mean in (0.00713, 12.0)]
+        ['0.00713 ± 0.00397', '12.0 ± 0.0']
         """
         if value is None or isinstance(value, str):
             return value or ""
         if isinstance(value, Estimate):
+            if self.digits is None:
+                first = math.floor(math.log10(abs(value.mean))) if value.mean else 0
+                return replace(self, digits=max(2 - first, 0)).text(value)
             few = f" [{value.count} of {value.asked} seeds]" if value.asked > value.count else ""
             return self.text(value.mean) + (self._spread(value) if self.spread else "") + few
         sign = "+" if self.signed or isinstance(value, Difference) else ""
