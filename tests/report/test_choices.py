@@ -127,12 +127,12 @@ def test_changes_are_against_the_same_seed(tmp_path):
     own, change = rows_of(text, "grid_64")
     # Deviations of 0.75 and, of the changes -1.0, -0.5 and -0.75, of 0.25; times 4.303 / sqrt(3).
     assert own[1:3] == ["3", "28.25 ± 1.86"]
-    assert change[1:5] == ["base", "3", "-0.75 ± 0.62", "+0.0000 ± 0.0000"]
+    assert change[1:5] == ["base", "3", "-0.75 ± 0.62", "0.0000 ± 0.0000"]
     # PSNR, SSIM and EPE; the other changes are of one seed.
     assert "3 differences are of three seeds or more; by chance 0.15 of their intervals" in text
     half, same, twice = (f"×{x} (×{x} to ×{x})" for x in ("0.50", "1.00", "2.00"))
     assert change[5:] == ["-0.1000 ± 0.0000", half, same, same, same, twice]
-    assert rows_of(text, "unet_16")[0][1:6] == ["grid_64", "1", "+1.50", "+0.0000", ""]
+    assert rows_of(text, "unet_16")[0][1:6] == ["grid_64", "1", "+1.50", "0.0000", ""]
     assert rows_of(text, "rays=64")[1][1:4] == ["base", "1", "+1.00"]
     assert rows_of(text, "backward-fast rays=64")[0][1:4] == ["rays=64", "1", "+0.50"]
     assert len(rows_of(text, "base")) == 2  # of each scene

@@ -37,13 +37,13 @@ def test_runs_side_by_side_with_their_difference(ok, runs, monkeypatch):
     runs(one=of("forward", scores | {"psnr": 31.5}, **flow), two=of("backward", scores, **flow))
     done = ok("report", "kind=compare", "runs=[one,two]")
     head, _, *rows = (line.split("  ") for line in done.out.splitlines())
-    heads = ["PSNR (dB) of test views", "forward", "backward", "difference"]
+    heads = ["PSNR (dB) of test views", "forward", "backward", "forward - backward"]
     assert [word.strip() for word in head if word] == heads
     assert [[word.strip() for word in row if word] for row in rows] == [
         ["all", "31.50", "30.00", "+1.50"],
-        ["LPIPS (vgg), all", "0.1000", "0.1000", "+0.0000"],
-        ["Mean error, all", "0.250", "0.250", "+0.000"],
-        ["moving points' error, % of motion", "25", "25", "+0"],
+        ["LPIPS (vgg), all", "0.1000", "0.1000", "0.0000"],
+        ["Mean error, all", "0.250", "0.250", "0.000"],
+        ["moving points' error, % of motion", "25", "25", "0"],
         ["steps", "100", "100"],
         ["seconds of training", "50", "50"],
         ["seconds per image", "0.500", "0.500"],
@@ -139,9 +139,10 @@ def test_differences_are_in_pairs_by_seed_and_view_and_say_where_no_seed_is_shar
         return {row[0]: row[-1] for row in table.rows}, table.caption
 
     rows, caption = table_of((0, 1, 2), (0, 1, 2))
-    assert rows["LPIPS (alex), all"] == "-0.4000 ± 0.0000"  # of view a, which both have
-    assert caption.endswith("differences are paired by seed")
+    assert rows["LPIPS (alex), all"] == "-0.4000 ± 0.0000, better"  # of view a, which both have
+    assert rows["all"] == "0.00 ± 0.00, no difference shown"
+    assert "\ndifferences are paired by seed\n2 differences are of three seeds or more; by" in caption
     rows, caption = table_of((0, 1), (2, 3))
     assert (rows["all"], rows["steps"], "paired" in caption) == ("no seed in common", None, False)
     rows, caption = table_of((0,), (2,))
-    assert (rows["all"], caption) == ("+0.00", "differences are of one run each, of other seeds")
+    assert (rows["all"], caption) == ("0.00", "differences are of one run each, of other seeds")

@@ -433,7 +433,7 @@ def test_the_page_says_which_of_the_papers_orders_hold(tmp_path):
     assert ours[6:] == ["×1.00", "21.00 ± 2.48", "", "", "0.083", "×1.00"]
     assert no_tv[1:7] == ["-0.45", "27.10 ± 2.73", "+1.10 ± 0.25", "reversed", "0.250", "×0.50"]
     assert no_tv[7:10] == ["20.00 ± 2.48", "-1.00 ± 0.00", "holds"]
-    assert no_flow[1:2] + no_flow[3:7] == ["-0.01", "+0.00 ± 0.25", "no difference shown", "0.250", "×0.50"]
+    assert no_flow[1:2] + no_flow[3:7] == ["-0.01", "0.00 ± 0.25", "no difference shown", "0.250", "×0.50"]
     assert no_flow[7:] == [""] * 5
     assert rows_of(section, "w/o coarse stage")[0][3:5] == ["-1.10 ± 0.25", "holds"]
     assert rows_of(section, "canonical time in the middle")[0][3:5] == ["-0.40 ± 0.00", "reversed"]

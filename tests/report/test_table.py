@@ -180,7 +180,10 @@ def test_seeds_are_one_column_and_differences_are_paired(tmp_path):
     assert {name: len(own) for name, own in groups.items()} == {"rigid=0": 3, "rigid=1": 3}
     found = compare(groups)
     (row,) = [row for row in found.rows if row[0] == "all"]
-    assert row[1:] == ["30.17 ± 2.59", "31.00 ± 2.48", "-0.83 ± 0.72"]
+    assert row[1:] == ["30.17 ± 2.59", "31.00 ± 2.48", "-0.83 ± 0.72, below"]
+    assert found.columns[-1].name == "rigid=0 - rigid=1"
+    # PSNR and SSIM, which is the same for all.
+    assert "2 differences are of three seeds or more; by chance 0.1 of their intervals" in found.caption
     assert "rigid=0: seeds 0, 1, 2; rigid=1: seeds 0, 1, 2" in found.caption
     assert "differences are paired by seed" in found.caption
 

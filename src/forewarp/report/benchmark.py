@@ -295,10 +295,15 @@ def above(group: Runs, other: Runs, name: str = "psnr") -> str:
     if None in (group.mean(name), other.mean(name)):
         return ""
     change, metric = paired_change(group.paired(other), name), metric_of(name)
+    return judged(change, metric.digits, metric.higher_is_better, metric.unit)
+
+
+def judged(change: Estimate | None, digits: int, higher_is_better: bool, unit: str = "") -> str:
+    """Write a change, with a verdict where it is of ``LEAST`` pairs or more."""
     if change is None:
         return "no seed in common"
-    words = ("above", "below") if metric.higher_is_better else ("worse", "better")
-    told = f"{Column('', metric.digits, signed=True).text(change)} {metric.unit}".rstrip()
+    words = ("above", "below") if higher_is_better else ("worse", "better")
+    told = f"{Column('', digits, signed=True).text(change)} {unit}".rstrip()
     return f"{told}, {verdict(change, *words)}" if change.count >= LEAST else told
 
 

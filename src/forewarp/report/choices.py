@@ -17,7 +17,7 @@ from statistics import mode
 
 from forewarp.files import read_json, replace_file
 from forewarp.metrics.registry import METRICS, metric_of
-from forewarp.report.benchmark import read_published
+from forewarp.report.benchmark import judged, read_published
 from forewarp.report.figures import draw_scene
 from forewarp.report.results import KINDS, PLACES, Point, Row, Runs, in_words, nothing, read_runs
 from forewarp.report.settings import CONDITIONS, family_of, words_of
@@ -346,14 +346,16 @@ SHOWN_CONDITIONS |= {"pictures": "pictures", "measured": "test views", "held_out
 def compare(groups: Mapping[str, Runs]) -> Table:
     """Make a table with a row for each measure that all runs have, and a column for each group of seeds.
 
-    Metrics are those of the test views; for two groups a column with the difference is added, in pairs by
-    seed where both have the same seeds. It is empty where they are of different scenes or views. Conditions
-    in which the groups differ come last. The caption says why there are no differences, or no metrics.
+    Metrics are those of the test views; for two groups a column with their difference is added, in pairs by
+    seed where both have the same seeds, with verdicts as on all pages. It is empty where they are of
+    different scenes or views. Conditions in which the groups differ come last. The caption says why there
+    are no differences, or no metrics.
 
     Args:
         groups: as of ``results.read_compared``.
     """
     lines, two, rows = [], len(groups) == 2, [own[0] for own in groups.values()]
+    changes: list[Estimate | None] = []
     same_scene = len({(row["dataset"], row["scene"]) for row in rows}) == 1
     same_views = same_scene and len({row["measured"] for row in rows}) == 1
     seeds = [sorted(row["seed"] for row in own) for own in groups.values()]
@@ -367,11 +369,12 @@ def compare(groups: Mapping[str, Runs]) -> Table:
         with_difference: bool = False,
         kind: str = "",
         measure: str = "",
+        higher_is_better: bool = False,
     ) -> None:
         values = [[value(row) for row in own] for own in groups.values()]
         if any(None in own for own in values):
             return
-        column, difference = Column("", digits), None
+        column, told = Column("", digits), None
         if with_difference and two:
             scored = [
                 Runs(
@@ -381,9 +384,8 @@ def compare(groups: Mapping[str, Runs]) -> Table:
                 for own in groups.values()
             ]
             pairs = [(scored[0][0], scored[1][0])] if alone else scored[0].paired(scored[1])
-            difference = paired_change(pairs, measure)
-        told = None if difference is None else replace(column, signed=True).text(difference)
-        told = "no seed in common" if with_difference and two and difference is None else told
+            changes.append(paired_change(pairs, measure))
+            told = judged(changes[-1], digits, higher_is_better)
         lines.append([name, *(column.text(Estimate.of(own)) for own in values), *[told] * two])
 
     every = [row for own in groups.values() for row in own]
@@ -392,7 +394,7 @@ def compare(groups: Mapping[str, Runs]) -> Table:
         for kind, words in KINDS.items() if metric.summary else ():
             name = words if metric.name == "psnr" else f"{metric.heading}, {words}"
             score = partial(_score, kind, metric.name)
-            add(name, score, metric.digits, same_views, kind, metric.name)
+            add(name, score, metric.digits, same_views, kind, metric.name, metric.higher_is_better)
     add("moving points' error, % of motion", _motion_share, 0, same_scene, measure="motion_error")
     for name, (words, digits) in MEASURED.items():
         add(words, partial(_measured, name), digits)
@@ -407,12 +409,14 @@ def compare(groups: Mapping[str, Runs]) -> Table:
         told.append(f"{INTERVALS}; {listed}")
         if is_paired and same_views:
             told.append("differences are paired by seed")
+        if is_paired and changes:
+            told.append(by_chance(changes))
     if alone and same_views and not is_paired:
         told.append("differences are of one run each, of other seeds")
     if not set.intersection(*(set(row["test"]) for row in every)):
         kinds = (f"{name}: {', '.join(own[0]['test']) or 'none'}" for name, own in groups.items())
         told.append(f"no metrics: no kind of test view was measured in all runs ({'; '.join(kinds)})")
-    return Table(["PSNR (dB) of test views", *groups, *["difference"] * two], lines, "\n".join(told))
+    return Table(["PSNR (dB) of test views", *groups, *[" - ".join(groups)] * two], lines, "\n".join(told))
 
 
 def _score(kind: str, metric: str, row: Row) -> float | None:

@@ -66,6 +66,8 @@ class Column:
 
         >>> [Column("PSNR", signed=True).text(Estimate.of(v)) for v in ([0.4, 0.5, 0.6], [0.4, 0.6], [0.4])]
         ['+0.50 ± 0.25', '+0.50 (+0.40, +0.60)', '+0.40']
+        >>> Column("%", 0, signed=True).text(Estimate(-0.3, 1.2, 3))
+        '0 ± 3'
         >>> Column("time", prefix="×").text(Factor.of([1.0, 2.0, 2.0]))
         '×1.59 (×0.59 to ×4.29)'
         >>> [Column("minutes", None).text(minutes) for minutes in (0.05, 1.0, 20.0)]
@@ -83,7 +85,8 @@ class Column:
             return self.text(value.mean) + (self._spread(value) if self.spread else "") + few
         sign = "+" if self.signed or isinstance(value, Difference) else ""
         form = ".4g" if self.digits is None else f".{self.digits}f"
-        return f"{self.prefix}{value:{sign}{form}}"
+        text = f"{value:{sign}{form}}"
+        return self.prefix + (text if float(text) else text.lstrip("+-"))  # 0 has no sign
 
     def _spread(self, value: Estimate) -> str:
         if isinstance(value, Factor):
