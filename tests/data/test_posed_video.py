@@ -248,6 +248,13 @@ def test_derived_ends_hold_what_is_looked_at_and_are_said(made, caplog):
     assert all(low < 0 < high for low, high in zip(scene.box.low, scene.box.high))
 
 
+def test_the_kind_of_depth_that_older_runs_have_is_read(tmp_path, made):
+    made()
+    read_scene(tmp_path, "toy", depth_kind="metric")
+    with refused("data.depth_kind: expected axis, ray, relative, inverse or null, but got 'metrik'"):
+        read_scene(tmp_path, "toy", depth_kind="metrik")
+
+
 def test_points_far_from_the_origin_are_as_exact_as_the_cameras(tmp_path):
     shift, random = np.array([456_012.0, 4_650_123.0, 80.0]), np.random.default_rng(0)
     points = MIDDLE.numpy() + random.uniform(-3, 3, (40, 3))

@@ -171,6 +171,7 @@ def read_scene(
     one_of(scale, "data.scale", *SCALES)
     whole(test_every, "data.test_every", 2)
     one_of(normalise, "data.normalise", True, False)
+    depth_kind = "axis" if depth_kind == "metric" else depth_kind  # as older runs have it
     one_of(depth_kind, "data.depth_kind", *METRIC, "relative", "inverse", None)
     is_metric = depth_kind in (*METRIC, None)
     if not isinstance(depth, (str, Path, type(None))):
