@@ -225,3 +225,13 @@ def test_a_plateau_is_two_doublings_in_a_row_that_gain_little(tmp_path, each_ste
     assert made.fit().global_step == 6
     done = made.finished()["coarse"]["target"]
     assert (done["reached"], done["step"], done["held_out_psnr"]) == ("target.plateau", 5, 24.0)
+
+
+def test_a_curve_that_is_flat_where_the_budget_ends_has_reached_no_plateau(tmp_path, each_step):
+    # Gains since half the steps: 2.7 of step 5, 1.0 of 6 (from 23.5), 0.7 of 7, the last of the stage.
+    each_step(20, 22, 23.5, 24, 25.5, 24.5, 24.5)
+    made, said = aimed(tmp_path, target=StopRule(plateau=1.5)), []
+    made.tell = said.append
+    assert made.fit().global_step == 7
+    assert made.finished()["coarse"]["target"]["reached"] is None
+    assert said == ["coarse: target.plateau=1.5 not reached within the budget"]

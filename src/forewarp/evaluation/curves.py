@@ -109,11 +109,15 @@ class AccuracyCurve(lightning.Callback):
         return self._steps_before + int(row["step"]) * (row["stage"] == module.settings.name)
 
     def _check_target(self, module) -> None:
-        """End the stage if its rows reach the target; what counts is when the first of two rows did."""
+        """End the stage if its rows reach the target; what counts is when the first of two rows did.
+
+        At the stage's end its budget ended it, and a schedule that comes to rest then, not a plateau.
+        """
         rows = [row for row in self._rows if row["stage"] == module.settings.name]
         curve = [(self._time_of(row, module), float(row["psnr"])) for row in rows]
         all_in = module.curriculum.in_play == len(module.curriculum.order)
-        if (key := self.target.reached(curve, all_in=all_in)) is not None:
+        is_flat = all_in and module.fraction < 1
+        if (key := self.target.reached(curve, all_in=is_flat)) is not None:
             when = {"seconds": float(rows[-2]["seconds"]), "step": int(rows[-2]["step"])}
             module.reached = {"reached": key, **when, "held_out_psnr": float(rows[-2]["psnr"])}
 
