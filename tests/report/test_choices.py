@@ -92,6 +92,19 @@ def test_runs_that_miss_the_target_that_all_had_are_counted(tmp_path):
     assert rows_of(text, "24")[0][1:3] == ["32.5 ± 15.2", "base"]
 
 
+def test_runs_that_a_target_ended_are_not_at_equal_minutes(tmp_path):
+    for variant, reached in (("base", "target.psnr"), ("never", None)):
+        target = {"psnr": 24.5, "plateau": None, "reached": reached}
+        write_run(tmp_path / "runs", variant, minutes=3.0, metrics={"target": target})
+    text = write_accuracy_time(tmp_path / "runs", tmp_path)[0].read_text()
+    assert "Budget of at most 3 minutes; runs ended by target.psnr=24.5 after the seconds trained" in text
+    assert "At equal minutes" not in text
+    assert rows_of(text, "never")[-1][-1] == "50.0"
+    write_run(tmp_path / "steps", minutes=None)
+    text = write_accuracy_time(tmp_path / "steps", tmp_path)[0].read_text()
+    assert "Budget of the steps of each; the steps that were done:" in text
+
+
 def test_some_training_views_are_no_seed_of_all_of_them(tmp_path):
     few = {"protocol": {"train_views": 16}}
     write_run(tmp_path / "a", "base", 0)

@@ -135,14 +135,33 @@ def variants(groups: Mapping[tuple, Runs], target: float) -> Table:
     columns = {"variant": "variant", "minutes": Column("minutes", None), "seeds": Column("seeds", 0)}
     columns |= {"reached": Column(f"seconds to {target:g} dB", 1), "who": "reached"}
     columns |= {"psnr": "PSNR at the end"} | {name: COSTS[name] for name in ("epe", "steps")}
-    lines = []
+    caption, lines = _bound(Runs(chain(*groups.values()))), []
+    if "target." in caption:
+        columns["trained"] = Column("seconds trained", 1)
     for group in groups.values():
         ends = Runs(row["points"][-1]._asdict() for row in group if row["points"])
         at_the_end = {name: ends.estimate(name) for name in ("psnr", "epe")}
         times = reached(group, target)
         who = f"{times.count if times else 0} of {len(group)}"
-        lines.append(group.summary(reached=times, who=who, **at_the_end))
-    return Table.of(lines, columns, "At equal minutes; the steps that were done in them:")
+        lines.append(group.summary(reached=times, who=who, trained=group.estimate("train"), **at_the_end))
+    return Table.of(lines, columns, caption)
+
+
+def _bound(runs: Runs) -> str:
+    """Say what bounded runs, and what ended some of them before."""
+    minutes = list(runs.by("minutes"))
+    ended = {}
+    for target in (row["metrics"].get("target") or {} for row in runs):
+        if key := target.get("reached"):
+            ended[f"{key}={target[key.removeprefix('target.')]:g}"] = None
+    most = " or ".join("the steps of each" if m is None else f"{m:g}" for m in minutes)
+    most += "" if minutes[-1] is None else f" minute{'s' * (minutes != [1])}"
+    if ended:
+        about = f"Budget of at most {most}; runs ended by {' or '.join(ended)}"
+        return f"{about} after the seconds trained, so that PSNR at the end is not at equal minutes:"
+    if len(minutes) == 1 and minutes[0] is not None:
+        return "At equal minutes; the steps that were done in them:"
+    return f"Budget of {most}; the steps that were done:"
 
 
 def write_price_list(folder: Path, out: Path) -> list[Path]:
