@@ -31,22 +31,20 @@ def test_each_decibel_names_the_first_to_reach_it_in_all_seeds(tmp_path):
     runs = tmp_path / "runs"
     write_run(runs, "base", 0, curve=((10, 24.0), (20, 25.2), (40, 25.5)))
     write_run(runs, "base", 1, curve=((10, 24.5), (30, 25.2), (40, 25.5)))
-    write_run(runs, "good", 0, curve=((15, 23.0), (35, 27.0), (60, 27.5)))
-    write_run(runs, "lucky", 0, curve=((1, 26.0), (2, 26.0)))
-    write_run(runs, "lucky", 1, curve=((90, 26.0), (99, 26.0)))
+    write_run(runs, "good", 0, curve=((15, 22.0), (60, 27.0), (61, 27.5)))
+    write_run(runs, "lucky", 0, curve=((1, 25.5), (2, 27.0), (3, 27.0)))
     page, picture, table = write_accuracy_time(runs, tmp_path / "out")
     text = page.read_text()
-    assert rows_of(text, "24") == [
-        ["24", "10.0 (10.0, 10.0)", "base", "`forewarp-train variant=base seed=0`"]
-    ]
-    assert rows_of(text, "25")[0][1:3] == ["25.0 (20.0, 30.0)", "base"]
-    assert rows_of(text, "26")[0][1:3] == rows_of(text, "27")[0][1:3] == ["35.0", "good"]
+    assert rows_of(text, "24")[0][1:] == ["<= 1.0", "reached before the first evaluation", ""]
+    # A third of the dB from 1 to 2 s: 2^(1/3); one seed each, so that no difference is shown.
+    assert rows_of(text, "26") == [["26", "1.3", "lucky, good", "`forewarp-train variant=lucky seed=0`"]]
+    assert rows_of(text, "27")[0][1:3] == ["2.0", "lucky, good"]
     assert rows_of(text, "28") == []
     assert "seconds to 25 dB" in text  # what the base reaches
     assert rows_of(text, "base")[0][1:] == [
         "1",
         "2",
-        "25.0 (20.0, 30.0)",
+        "19.9 (17.8, 21.9)",  # 10 * 2^(1/1.2) and 10 * 3^(0.5/0.7)
         "2 of 2",
         "25.50 (25.50, 25.50)",
         "",
@@ -68,7 +66,7 @@ def test_a_target_of_ones_own_and_what_has_no_curve(tmp_path):
     (tmp_path / "others.yaml").write_text(yaml.safe_dump([other._asdict() for other in others]))
     options = {"target": 20.0, "published": tmp_path / "others.yaml"}
     page = write_accuracy_time(tmp_path / "runs", tmp_path, **options)[0].read_text()
-    assert rows_of(page, "base")[0][1:7] == ["0.05", "1", "10.0", "1 of 1", "25.50", "0.2500"]
+    assert rows_of(page, "base")[0][1:7] == ["0.05", "1", "<= 10.0", "1 of 1", "25.50", "0.2500"]
     assert "* ball/failed-1.0-seed0: no accuracy_time.csv; run its command with data.held_out=8" in page
     assert "* ball/killed-1.0-seed0: no metrics.json; run its command again" in page
     assert not rows_of(page, "killed")
@@ -78,7 +76,7 @@ def test_a_target_of_ones_own_and_what_has_no_curve(tmp_path):
 
 def test_runs_that_miss_the_target_that_all_had_are_counted(tmp_path):
     common = {"config": {"target": {"psnr": 24.5, "plateau": None}}}
-    ends = {0: ((10, 20.0), (20, 24.6), (22, 24.7)), 1: ((10, 20.0), (30, 24.5), (33, 24.9))}
+    ends = {0: ((10, 20.0), (20, 24.5), (22, 24.7)), 1: ((10, 20.0), (30, 24.5), (33, 24.9))}
     ends |= {2: ((10, 20.0), (40, 24.9), (60, 24.4)), 3: ((10, 20.0), (40, 24.5), (41, 24.5))}
     for seed, curve in ends.items():
         write_run(tmp_path / "runs", "base", seed, curve=curve, **common)
@@ -88,8 +86,20 @@ def test_runs_that_miss_the_target_that_all_had_are_counted(tmp_path):
     # 20, 30 and 40 s: a deviation of 10, times 4.303 / sqrt(3).
     assert rows_of(text, "base")[0][2:5] == ["4", "30.0 ± 24.8", "3 of 4"]
     assert rows_of(text, "never")[0][3:5] == ["", "0 of 1"]
-    # All four reach 24 dB, after 20, 30, 40 and 40 s: a deviation of 9.574, times 3.182 / 2.
-    assert rows_of(text, "24")[0][1:3] == ["32.5 ± 15.2", "base"]
+    # All four reach 24 dB, after 18.5, 26.6, 31.0 and 34.3 s: a deviation of 6.83, times 3.182 / 2.
+    assert rows_of(text, "24")[0][1:3] == ["27.6 ± 10.9", "base"]
+
+
+def test_a_winner_is_named_where_three_seeds_show_it_and_else_who_shares_the_row(tmp_path):
+    rows = (2, 20.5), (8, 24.5), (16, 26.0), (20, 26.0)
+    for seed, factor in enumerate((100, 110, 90)):
+        for variant, times in (("base", factor), ("near", 202 - factor)):
+            write_run(tmp_path, variant, seed, curve=[(times * s, psnr) for s, psnr in rows])
+        quick = [(factor * s // 2, psnr) for s, psnr in rows[:2]]
+        write_run(tmp_path, "quick", seed, curve=[*quick, (9000, 24.5)])
+    text = write_accuracy_time(tmp_path, tmp_path / "out")[0].read_text()
+    assert rows_of(text, "24")[0][2:] == ["quick", "`forewarp-train variant=quick seed=0`"]
+    assert rows_of(text, "25")[0][2] == "base, near"
 
 
 def test_runs_that_a_target_ended_are_not_at_equal_minutes(tmp_path):

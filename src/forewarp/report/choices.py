@@ -21,24 +21,44 @@ from forewarp.report.benchmark import judged, read_published
 from forewarp.report.figures import draw_scene
 from forewarp.report.results import KINDS, PLACES, Point, Row, Runs, in_words, nothing, read_runs
 from forewarp.report.settings import CONDITIONS, family_of, words_of
-from forewarp.report.statistics import FACTORS, INTERVALS, Estimate, by_chance, paired_change, verdict
+from forewarp.report.statistics import (
+    FACTORS,
+    INTERVALS,
+    LEAST,
+    Estimate,
+    by_chance,
+    paired_change,
+    rank,
+    verdict,
+)
 from forewarp.report.stored import read_any, stored_csv
 from forewarp.report.tables import Column, Table, rendered, score_columns
 
 COSTS = {"epe": Column("EPE", 4), "step": Column("s/step", None), "frame": Column("s/frame", None)}
 COSTS |= {"memory": Column("GiB"), "parameters": Column("parameters (M)", 3), "steps": Column("steps", 0)}
+NAMED = 4  # variants at most that share a row by name
 CHOICES = {"auto": "planned", "base": "the preset", "all_effects": "every effect", "no_effects": "none"}
 
 
 def seconds_to(points: Sequence[Point], psnr: float) -> float | None:
-    """Return the seconds until two evaluations in a row first reach a PSNR (dB); None if none do.
+    """Return the seconds until a PSNR (dB) is first reached that two evaluations in a row have; None if none.
 
-    >>> curve = [Point(s, p, 0) for s, p in [(1, 20), (2, 25), (4, 24), (8, 26), (16, 27)]]
-    >>> seconds_to(curve, 25), seconds_to(curve, 27), seconds_to([], 25)
-    (8, None, None)
+    Between the evaluation before and the first of the two PSNR is taken to grow with the logarithm of time.
+    Where the curve begins with these two, its first seconds are returned, as a bound: it got there before.
+
+    >>> curve = [Point(s, p, 0) for s, p in [(1, 20), (2, 25), (4, 24), (16, 26), (32, 27)]]
+    >>> seconds_to(curve, 25), seconds_to(curve, 18), seconds_to(curve, 27), seconds_to([], 25)
+    (8.0, 1, None, None)
     """
-    steps = zip(points, points[1:])
-    return next((a.seconds for a, b in steps if a.psnr >= psnr and b.psnr >= psnr), None)
+    before = None
+    for a, b in zip(points, points[1:]):
+        if a.psnr >= psnr and b.psnr >= psnr:
+            if before is None or not 0 < before.seconds < a.seconds:
+                return a.seconds
+            share = (psnr - before.psnr) / (a.psnr - before.psnr)
+            return before.seconds * (a.seconds / before.seconds) ** share
+        before = a
+    return None
 
 
 def by_variant(runs: Runs, *names: str) -> dict:
@@ -117,17 +137,50 @@ def reached(runs: Runs, psnr: float) -> Estimate | None:
     return Estimate.of(seconds_to(row["points"], psnr) for row in runs)
 
 
+def begins_at(runs: Runs, psnr: float) -> bool:
+    """Whether a run's curve begins at a PSNR already, so that the mean of ``reached`` is a bound."""
+    curves = [row["points"] for row in runs if row["points"]]
+    return any(seconds_to(curve, psnr) == curve[0].seconds for curve in curves)
+
+
+def _seconds(column: Column, runs: Runs, psnr: float) -> Estimate | str | None:
+    """Return the cell of ``reached``: where curves begin at the PSNR, a bound in words."""
+    seconds = reached(runs, psnr)
+    return f"<= {column.text(seconds.mean)}" if begins_at(runs, psnr) else seconds
+
+
 def cheapest(groups: Mapping[tuple, Runs]) -> Table:
-    """List for every whole dB the variant that reaches it first, with the command."""
-    lines = []
+    """List for every whole dB the variants that reach it first, the fastest first, with its command.
+
+    Variants share a row unless the seeds show that they differ (``statistics.rank``, of the logarithms of
+    their seconds); where a curve begins at the PSNR, none is named.
+    """
+    lines, column = [], Column("seconds", 1)
     values = [point.psnr for group in groups.values() for row in group for point in row["points"]]
     for psnr in range(math.ceil(min(values)), math.floor(max(values)) + 1):
-        times = [(reached(group, psnr), group) for group in groups.values()]
-        if known := [(seconds, of[0]) for seconds, of in times if seconds and seconds.count == len(of)]:
-            seconds, row = min(known, key=lambda pair: pair[0].mean)
-            lines.append([str(psnr), seconds, row["variant"], f"`{row['command']}`"])
-    columns = ["for dB", Column("seconds", 1), "variant", "command"]
-    return Table(columns, lines, "The cheapest way to each PSNR, by the means alone, without a verdict:")
+        times = {key: reached(group, psnr) for key, group in groups.items()}
+        known = [key for key, seconds in times.items() if seconds and seconds.count == len(groups[key])]
+        if not known:
+            continue
+        known.sort(key=lambda key: times[key].mean)
+        fastest = groups[known[0]]
+        if any(begins_at(groups[key], psnr) for key in known):
+            most = f"<= {column.text(times[known[0]].mean)}"
+            lines.append([str(psnr), most, "reached before the first evaluation", ""])
+            continue
+        logs = {
+            key: {row["seed"]: math.log(seconds_to(row["points"], psnr)) for row in groups[key]}
+            for key in known
+        }
+        first, *_ = rank(logs, higher_is_better=False) or [known]
+        ranked = [key for key in known if len(logs[key]) >= LEAST]
+        names = dict.fromkeys(groups[key][0]["variant"] for key in known if key in first or key not in ranked)
+        shown, more = list(names)[:NAMED], len(names) - NAMED
+        words = ", ".join(shown) + (f" and {more} more" if more > 0 else "")
+        lines.append([str(psnr), times[known[0]], words, f"`{fastest[0]['command']}`"])
+    columns = ["for dB", column, "variants", "command of the first"]
+    about = "those whose seconds are not shown to differ share a row, the fastest first"
+    return Table(columns, lines, f"The cheapest way to each PSNR; {about}:")
 
 
 def variants(groups: Mapping[tuple, Runs], target: float) -> Table:
@@ -141,9 +194,9 @@ def variants(groups: Mapping[tuple, Runs], target: float) -> Table:
     for group in groups.values():
         ends = Runs(row["points"][-1]._asdict() for row in group if row["points"])
         at_the_end = {name: ends.estimate(name) for name in ("psnr", "epe")}
-        times = reached(group, target)
+        times, cell = reached(group, target), _seconds(columns["reached"], group, target)
         who = f"{times.count if times else 0} of {len(group)}"
-        lines.append(group.summary(reached=times, who=who, trained=group.estimate("train"), **at_the_end))
+        lines.append(group.summary(reached=cell, who=who, trained=group.estimate("train"), **at_the_end))
     return Table.of(lines, columns, caption)
 
 
