@@ -383,7 +383,7 @@ def test_masks_of_a_folder_go_by_the_users_names(tmp_path):
 @pytest.mark.parametrize(
     ("names", "value", "says"),
     [
-        (["0.png", "1.png", "2.png"], 100, "is bright, but got none above 127 of 255; write it as 255"),
+        (["0.png", "1.png", "2.png"], 0, "is bright, but got none above 127 of 255, nor .* write it as 255"),
         (["1.png", "2.png"], 255, r"expected 3 masks, .* \(0.png\), but got 2"),
     ],
 )

@@ -242,7 +242,7 @@ def test_masks_that_changed_are_read_again(forewarp, refused, in_tmp, monkeypatc
     with monkeypatch.context() as patched:
         patched.setattr("forewarp.capture.poses.find_features", stop)
         assert forewarp("capture", *words).status == 130
-    write_masks(100)
+    write_masks(100)  # no label either, without a 0
     assert "what moves is bright, but got none above 127 of 255" in refused("capture", *words)
 
 

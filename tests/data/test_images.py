@@ -15,6 +15,7 @@ from forewarp.data.images import (
     ImageCache,
     StoredImage,
     StoredMask,
+    bright,
     composited,
     halved_cutout,
     inspect_image,
@@ -169,6 +170,25 @@ def test_every_object_of_a_mask_is_foreground(tmp_path, kind):
         mask = mask.point([60, 128, 200, 255, 130] + 251 * [0])
     mask.save(tmp_path / "mask.png")
     assert StoredMask(tmp_path / "mask.png", (10, 6))().tolist() == (numbers > 0).tolist()
+
+
+@pytest.mark.parametrize("levels", [(90, 200), (2, 200), (38, 75), (38, 38), (24, 11), (127, 255)])
+def test_every_label_of_a_grey_mask_is_foreground(tmp_path, levels):
+    pixels = np.zeros((20, 30), np.uint8)
+    pixels[3:9, 4:10], pixels[11:18, 15:29] = levels
+    write_image(tmp_path / "mask.png", pixels)
+    assert torch.equal(bright(tmp_path / "mask.png"), torch.from_numpy(pixels > 0))
+
+
+@pytest.mark.parametrize("kind", ["half", "bilinear", "JPEG"])
+def test_soft_edges_are_no_labels(tmp_path, kind):
+    row, column = np.mgrid[:64, :96]
+    disc = Image.fromarray(np.uint8(255 * ((row - 31) ** 2 + (column - 44) ** 2 < 600)))
+    if kind != "JPEG":
+        disc = disc.resize((48, 32), Image.BOX if kind == "half" else Image.BILINEAR)
+    path = tmp_path / ("mask.jpg" if kind == "JPEG" else "mask.png")
+    disc.save(path)
+    assert torch.equal(bright(path), torch.from_numpy(np.array(Image.open(path)) > 127))
 
 
 class Owner:

@@ -357,7 +357,7 @@ def masked(tmp_path, made):
     return mask
 
 
-@pytest.mark.parametrize("brightness", [255, 1])
+@pytest.mark.parametrize("brightness", [255, 1, 38])
 def test_masks_of_nerfstudio_tell_where_to_train_and_measure(tmp_path, masked, brightness):
     mask = torch.from_numpy(masked(brightness))
     data = PosedVideoDataModule(tmp_path, "toy", rays=2000)
@@ -433,11 +433,30 @@ def test_a_key_that_is_null_is_absent(tmp_path, made):
 
 
 def test_masks_that_cannot_be_meant_are_refused(tmp_path, masked):
-    masked(100)
-    with refused(r"m_0.png: expected a mask with a bright pixel.*none above 127"):
+    mask = masked()
+    for i in range(10):  # which of two is the subject's?
+        write_image(tmp_path / "toy" / "masks" / f"m_{i}.png", np.where(mask, 24, 11).astype(np.uint8))
+    with refused(
+        r"m_\d.png: expected a mask with a bright pixel.*nor labels beside 0; write .* and all else"
+    ):
         read_scene(tmp_path, "toy")
     with refused("data.masks: expected alpha, ignore, off or null, but got 'x'"):
         read_scene(tmp_path, "toy", masks="x")
+
+
+def test_frames_whose_mask_is_dark_are_left_out_and_counted(tmp_path, masked):
+    mask = masked()
+    for i in (0, 4):
+        write_image(tmp_path / "toy" / "masks" / f"m_{i}.png", np.zeros((20, 30), np.uint8))
+    scene = read_scene(tmp_path, "toy")
+    frames = (*scene.train, *scene.test)
+    assert len(frames) == 8
+    assert all(np.array_equal(frame.load_valid(), mask) for frame in frames)
+    (line,) = (line for line in scene.protocol["assumed"] if "dark everywhere" in line)
+    assert "2 masks are dark everywhere (m_0.png, ..)" in line
+    write_image(tmp_path / "toy" / "masks" / "m_0.png", np.zeros((10, 15), np.uint8))
+    with refused("m_0.png: expected 30 x 20 pixels as .*, but got 15 x 10; resize it to 30 x 20"):
+        read_scene(tmp_path, "toy")
 
 
 def test_alpha_over_an_image_is_not_taken_for_a_cut_out_unasked(tmp_path):

@@ -40,8 +40,8 @@ _BLACK, _LIT = 24, 60  # of 255: in a bar at most, black of limited range and no
 _EVEN, _LEAST_BAR = 2, 0.02  # pixels of 640 by which bars at both sides may differ; least share of the side
 _WHOLE = 0.9  # share of its duration after which a video counts as whole
 NO_MASKS = (
-    "expected masks in which what moves is bright, but got none above 127 of 255; write it as 255, or leave "
-    "out masks="
+    "expected masks in which what moves is bright, but got none above 127 of 255, nor labels beside 0; write "
+    "it as 255 and all else as 0, or leave out masks="
 )
 _UNSAID = (
     "10 bits or more of BT.2020 without a transfer are taken for SDR; if colours look faded, tag it as HLG "

@@ -45,6 +45,7 @@ _FOREGROUND = 127  # a mask above it is foreground; masks are lossy, so never qu
 _COLORED = 32  # of 255: difference of channels of a mask with colours; all of a DAVIS palette are as bright
 _OWN_PAGES = 1 << 20  # bytes of a kept tensor from which it has pages of its own
 _NUMBERED = 15  # a mask nowhere above it holds numbers of objects
+_LABELS = 32  # levels of grey, or fewer, that may be those of objects
 
 
 class ImageCache:
@@ -141,7 +142,9 @@ def inspect_image(path: Path, size: tuple[int, int] | None = None, why: str = ""
     with opened(path, MOST_IMAGE, "an image") as stream:
         header = _inspect(stream, path)
     if size not in (None, header.size):
-        advice = TURN if header.size == tuple(size)[::-1] else ""
+        (width, height), found = size, header.size
+        is_like = abs(found[0] * height - found[1] * width) <= max(*size, *found)
+        advice = TURN if found == (height, width) else f"resize it to {by(size)}" * is_like
         raise mismatch(path, f"{by(size)} pixels{why}", by(header.size), advice)
     return header
 
@@ -371,14 +374,18 @@ class StoredMask:
 
     def __call__(self) -> Tensor:
         """Give the mask; SceneError where it cannot be decoded, has another size or is dark everywhere."""
+        if self.is_dark():
+            advice = "write what counts as 255 and all else as 0, or set data.masks=off"
+            got = "none above 127 of 255, nor labels beside 0"
+            raise mismatch(self.path, "a mask with a bright pixel", got, advice)
         return CACHE.get(self, self._decode)
 
+    def is_dark(self) -> bool:
+        """Tell whether it is dark everywhere; SceneError where it cannot be decoded or has another size."""
+        return not bool(CACHE.get(self, self._decode).any())
+
     def _decode(self) -> Tensor:
-        mask = bright(self.path, self.size, self.of_alpha)
-        if not bool(mask.any()):
-            expected, advice = "a mask with a bright pixel", "remove the frame, or set data.masks=off"
-            raise mismatch(self.path, expected, "none above 127", advice)
-        return mask
+        return bright(self.path, self.size, self.of_alpha)
 
 
 class MovingMask(StoredMask):
@@ -386,6 +393,10 @@ class MovingMask(StoredMask):
 
     The file may be some times as large as ``size``: a pixel moves where half of it does.
     """
+
+    def __call__(self) -> Tensor:
+        """Give the mask; SceneError where it cannot be decoded."""
+        return CACHE.get(self, self._decode)
 
     def _decode(self) -> Tensor:
         mask, shape = bright(self.path), self.size[::-1]
@@ -396,8 +407,9 @@ class MovingMask(StoredMask):
 
 def bright(path: Path, size: tuple[int, int] | None = None, of_alpha: bool = False) -> Tensor:
     """Decode what is foreground in a mask, (H, W) bool: where it is above 127; in one with colours, as a
-    palette has them for several objects, whatever is not black; in one of small numbers, whatever is not 0.
-    Of a mask of one colour whose alpha varies the alpha counts.
+    palette has them for several objects, whatever is not black; in one of small numbers, and in a PNG of few
+    levels that fill areas beside 0, as labels do and soft edges don't, whatever is not 0. Of a mask of one
+    colour whose alpha varies the alpha counts.
 
     Args:
         path: of the mask.
@@ -412,8 +424,26 @@ def bright(path: Path, size: tuple[int, int] | None = None, of_alpha: bool = Fal
         of_alpha = bool((rgba[..., :3] == rgba[0, 0, :3]).all())
     values = rgba[..., 3] if of_alpha else rgba[..., :3].amax(-1)
     is_colored = not of_alpha and int((values - rgba[..., :3].amin(-1)).max()) >= _COLORED
-    least = _COLORED if is_colored else (_FOREGROUND + 1 if int(values.max()) > _NUMBERED else 1)
-    return values >= least
+    is_labels = not of_alpha and path.suffix.lower() == ".png" and _are_labels(values)
+    if is_labels or int(values.max()) <= _NUMBERED:
+        return values > 0
+    return values >= (_COLORED if is_colored else _FOREGROUND + 1)
+
+
+def _are_labels(values: Tensor) -> bool:
+    """Tell whether a mask (H, W) holds labels of objects: few levels, 0 too, of which the dark fill areas.
+
+    Soft edges are a pixel wide: of most of their pixels no square of 2 x 2 has one level.
+    """
+    levels = values.unique()
+    dark = (values > 0) & (values <= _FOREGROUND)
+    if int(levels[0]) > 0 or len(levels) > _LABELS or not bool(dark.any()):
+        return False
+    across, down = values[:, 1:] == values[:, :-1], values[1:] == values[:-1]
+    square = across[1:] & across[:-1] & down[:, 1:] & down[:, :-1]
+    pixel = torch.nn.functional.pad(square, (1, 1, 1, 1))
+    in_square = pixel[1:, 1:] | pixel[1:, :-1] | pixel[:-1, 1:] | pixel[:-1, :-1]
+    return int((dark & in_square).sum()) > int(dark.sum()) / 2
 
 
 def hides_image(rgba: Tensor) -> bool:

@@ -331,7 +331,7 @@ def _read_entries(
         SceneError: for every key or image that is missing or wrong.
     """
     images, assumed = read_frames(file, content, axes=axes, inverse=inverse, scale=scale)
-    entries, has_mask = [], []
+    entries, has_mask, dark = [], [], []
     for image in images:
         mask, valid, entry, has_alpha = None, None, image.entry, image.header.has_alpha
         if "mask_path" in entry.own and masks != "off":
@@ -342,7 +342,9 @@ def _read_entries(
             raise mismatch(image.path, expected, "neither", "set data.masks=null")
         if masks != "alpha" and (mask or masks == "ignore"):
             valid = StoredMask(mask or image.path, image.header.size, of_alpha=mask is None)
-            valid()  # refuses a mask without a bright pixel
+            if valid.is_dark():
+                dark.append(valid)
+                continue
         opaque = masks == "off" or (masks == "ignore" and mask is None)
         load = StoredImage(image.path, image.header.size, mask=None if valid else mask, opaque=opaque)
         has_mask.append(mask is not None)
@@ -365,6 +367,11 @@ def _read_entries(
                 depth=depth,
             )
         )
+    if dark:
+        names = f"{len(dark)} masks are dark everywhere ({dark[0].path.name}{', ..' * (len(dark) > 1)})"
+        assumed.append(f"{file}: {names}: nothing counts in their frames, which are left out")
+        if not entries:
+            dark[0]()  # refuses it
     for key, given in (
         ("mask_path", has_mask),
         ("moving_path", [e.beside["load_moving"] is not None for e in entries]),
