@@ -44,6 +44,10 @@ def in_groups(form: str, firsts, lasts) -> list[str]:
         (["2024-05-30", "2024-05-31", "2024-06-02"], [0, 86400, 259200]),
         (["sky_20240531", "sky_20240601", "sky_20240603"], [0, 86400, 259200]),
         ([f"10-{m:02d}-{s:02d}" for m, s in ((5, 58), (5, 59), (6, 1), (6, 2))], [0, 1, 3, 4]),
+        (in_groups("frame_{1:04d}{0}", "ab", range(3)), [0, 1, 2] * 2),  # of two cameras, not hexadecimal
+        (in_groups("{}{:03d}", "ab", range(3)), [0, 1, 2] * 2),
+        ([f"3d_{i}" for i in range(3)], [0, 1, 2]),
+        ([f"GX010042_{i:03d}" for i in range(3)], [0, 1, 2]),
         (["01.05.2024 10.30.59", "01.05.2024 10.31.00", "01.05.2024 10.31.02"], [0, 1, 3]),
     ],
 )  # fmt: skip
@@ -107,6 +111,10 @@ def test_cameras_beside_each_other_that_move_on_are_a_rig():
         ([f"frame_{i}" for i in range(-5, 6)], "what is beside the numbers differs"),
         (in_groups("20231115_1704{:02d}_{:02d}", range(9), range(3)), "names that tell times in one way"),
         (["t_1.000e-05", "t_2.000e-05"], "numbers with exponents"),
+        ([f"images/frame_{i:04x}" for i in range(18)], "'images/frame_000a': .* hexadecimal numbers"),
+        ([f"r_{i:x}" for i in range(18)], "names as 'r_a': .* hexadecimal numbers"),
+        ([f"{i:04X}" for i in range(158, 190)], "hexadecimal numbers"),
+        ([f"cam{k}/{i:03x}_rgb" for k in range(2) for i in range(12)], "hexadecimal numbers"),
         (["cap_235000", "cap_235900", "cap_001000"], "times of day more than half a day apart"),
         ([f"{c}_{i}" for c, n in ((1, 9), (2, 5)) for i in range(n)], "names that tell times in one way"),
     ],
@@ -148,6 +156,8 @@ def test_a_pattern_settles_every_case():
     assert read_names(["a1.5", "a2"], "t.json", r"a(?P<time>[\d.]+)").frames == [1.5, 2]
     films = [f"clip{c}_{f}" for c, f in ((1, 0), (1, 2), (2, 0), (10, 0))]
     assert read_names(films, "t.json", r"(?P<part>\d+)_(?P<frame>\d+)").frames == [0, 2, 4, 6]
+    found = read_names([f"r_{i:04x}" for i in range(20)], "t.json", "_(?P<frame>[0-9a-f]+)")
+    assert found.frames == [*range(20)]
     clocks = ["x_10-05-59", "x_10-06-01.5", "x_00:07"]
     assert read_names(clocks, "t.json", "_(?P<time>.*)").frames == [36359, 36361.5, 7]
     dated = read_names(["2024-05-01 23.59.59", "2024-05-02 00.00.01"], "t.json", "(?P<time>.*)")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -34,6 +35,7 @@ _LETTER_WORD = re.compile(r"(?i)(?:^|[^a-z])[cv][_( -]*$")  # before two digits 
 _SPLIT_WORD = re.compile(r"(?i)(?:^|/)(train|val|valid|validation|eval|test)\b")
 _OF_TIME = re.compile(r"(?:(\d+)[h:_.-])?(\d{1,2})[m:_.-](\d\d(?:[.,]\d+)?)s?")  # of a group ``time``
 _EXPONENT = re.compile(r"\d\.\d*[eE][-+]?\d")
+_HEXADECIMAL = re.compile(r"[0-9a-f]+|[0-9A-F]+")
 _CLOCK = re.compile(r"([01]\d|2[0-3])([0-5]\d)([0-5]\d)?")  # digits that may be a time of day
 _ODD = 0.2  # share of the names that may have another form than all others, and are then named in the error
 _LEAST_WORDS = 4  # different texts beside the numbers, from which on these may tell nothing
@@ -187,6 +189,7 @@ def read_names(
     """
     if pattern is not None:
         return _by_pattern(names, where, pattern)
+    _refuse_hexadecimal(names, where)
     rows = _of_one_form(_with_days(names), names, where) if names else None
     if rows is None:
         return None
@@ -228,13 +231,16 @@ def _by_pattern(names: Sequence[str], where: str, pattern: str) -> NameNumbers:
     if len(groups) != 1:
         got = " and ".join(groups) or "neither"
         raise mismatch("data.name_pattern", "a group named time or frame, as (?P<frame>[0-9]+)", got)
-    matches, frames = [compiled.search(name) for name in names], []
+    matches = [compiled.search(name) for name in names]
     if None in matches:
         missed = names[matches.index(None)]
         raise mismatch("data.name_pattern", f"to be found in every name of {where}", f"not in '{missed}'")
-    for name, match in zip(names, matches):
-        frames.append(_number_of(match[groups[0]]))
-        if not math.isfinite(frames[-1]):
+    texts = [match[groups[0]] or "" for match in matches]
+    frames = [_number_of(text) for text in texts]
+    if not all(map(math.isfinite, frames)) and all(map(_HEXADECIMAL.fullmatch, texts)):
+        frames = [float(int(text, 16)) for text in texts]
+    for name, match, frame in zip(names, matches, frames):
+        if not math.isfinite(frame):
             got = f"'{match[groups[0]]}' of '{name}'"
             raise mismatch(f"data.name_pattern: group {groups[0]}", "a number", got)
     if "part" in compiled.groupindex:
@@ -255,6 +261,27 @@ def _by_pattern(names: Sequence[str], where: str, pattern: str) -> NameNumbers:
         raise mismatch("data.name_pattern", expected, got, advice)
     refuse_far(dict(zip(names, frames)), where, "time", "rename it, or set another data.name_pattern")
     return NameNumbers(frames, cameras, "taken from the images' names by data.name_pattern")
+
+
+def _refuse_hexadecimal(names: Sequence[str], where: str) -> None:
+    """Refuse counters that have letters a to f at the place of digits, as 0009 and 000a, or 9, a and 10."""
+    fields = [re.split(r"[^0-9A-Za-z]+", name.rpartition("/")[2]) for name in names]
+    if len({*map(len, fields)}) > 1:
+        return
+    for values in zip(*fields):
+        prefix = os.path.commonprefix(values).rstrip("0123456789")
+        rests = [value.removeprefix(prefix) for value in values]
+        if not all(map(_HEXADECIMAL.fullmatch, rests)) or all(map(str.isdigit, rests)):
+            continue
+        if len({*map(len, rests)}) == 1:
+            is_mixed = any(len({c.isdigit() for c in column}) > 1 for column in zip(*rests))
+        else:  # not filled with zeros
+            is_filled = any(len(rest) > 1 and rest[0] == "0" for rest in rests)
+            is_mixed = not is_filled and {rest[0].isdigit() for rest in rests} == {True, False}
+        if is_mixed:
+            name = next(name for name, rest in zip(names, rests) if not rest.isdigit())
+            what = "what is beside the numbers differs from image to image, as of hexadecimal numbers"
+            raise _two_ways(where, name, what)
 
 
 def _number_of(text: str | None) -> float:
