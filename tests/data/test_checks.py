@@ -184,6 +184,17 @@ def with_depth(value):
 
 
 @pytest.mark.parametrize(
+    ("size", "focal", "is_told"),
+    [((128, 96), 24, True), ((1920, 1080), 24, True), ((128, 96), 40, True), ((128, 96), 46.5, False)],
+)
+def test_focal_lengths_in_millimetres_are_told(size, focal, is_told):
+    inner = {"fx": focal, "fy": focal, "cx": size[0] / 2, "cy": size[1] / 2}
+    scene = filmed_by(lambda camera: replace(camera, width=size[0], height=size[1], **inner))
+    lines = [line for line in remarks(scene) if "divide it by the sensor's width" in line]
+    assert len(lines) == is_told
+
+
+@pytest.mark.parametrize(
     ("scene", "said"),
     [
         (far_off(1000), r"3 of 3 test images see nothing of the box .*in other units"),
@@ -191,7 +202,7 @@ def with_depth(value):
         (with_depth(3000.0), "depth is 3000 in the median, with near at 1 and far at 5.5; write it in the"),
         (
             filmed_by(lambda camera: replace(camera, fx=2.0, fy=2.0)),
-            "images are 152 degrees wide, as if focal lengths were in millimetres; write them in pixels",
+            "images are 152 degrees wide, as if .* not in pixels; if fl_x is in millim.* by w",
         ),
         (filmed_by(lambda camera: replace(camera, fy=10.0)), "pixels are 0.521 times as wide as high"),
         (filmed_by(lambda _: SCENE.train[0].camera), "in one place"),

@@ -25,6 +25,8 @@ MOST_UNITS = 1e9  # largest coordinate: farther from the origin single precision
 _LARGER, _SAME_FACTOR = 1.5, 0.1  # of a middle beyond the image's own, which tells a larger image's
 _LEAST_FACTOR, _EXCHANGED = 0.1, 0.05  # of a smaller image's middle; by which exchanged sides may be off
 _FEW_PIXELS = 8  # of a side, which is no image
+IN_PIXELS = "if fl_x is in millimetres, multiply it by w and divide it by the sensor's width"
+IN_PIXELS += "; if it is a share of the width, multiply it by w"
 SPLITS = ("train", "val", "test")
 _SAME_PIXEL = 0.01
 # Near and far as shares of the cameras' distance from what they look at, where nothing else is known. Two

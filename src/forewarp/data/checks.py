@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 import torch
 from torch import Tensor
 
-from forewarp.data.cameras import nine_pixels
+from forewarp.data.cameras import IN_PIXELS, nine_pixels
 from forewarp.data.directions import common_point
 from forewarp.data.files import mismatch
 from forewarp.data.images import by
@@ -23,7 +23,8 @@ _EDGE, _LEFT_OUT = 0.9, 0.02  # shares of an inverted image: subject along its e
 _SIDE, _HOLLOW = 0.5, 0.33  # of one whose subject crosses edges: at two opposite ones, in its middle ninth
 _WITHIN = 5  # points along a side of the box that cameras are asked for
 _FAINT = 8  # of 255: alpha that is nowhere above it was written as 0 and 1
-_WIDEST, _ZOOMED = 130, 1.25  # degrees of a pinhole camera; focal lengths of test and training images
+# Degrees of a pinhole camera, of which phones' widest have 108; focal lengths of test and training images.
+_WIDEST, _ZOOMED = 110, 1.25
 _ASIDE = 0.25  # share of a side by which a principal point is far from the middle
 _CROPPED, _MIDDLE = 0.08, 0.01  # shares by which one of a crop is off, and the other at most
 _STRETCHED, _SAME_PLACE = 1.25, 1e-9  # sides of a pixel; share of the cameras' distance from the origin
@@ -120,8 +121,8 @@ def _pinholes(scene: Scene) -> Iterator[str]:
         yield f"pixels are {ratio:.3g} times as wide as high, by their focal lengths; compare both"
     widest = max(max(f.camera.width / f.camera.fx, f.camera.height / f.camera.fy) for f in scene.train)
     if (degrees := math.degrees(2 * math.atan(widest / 2))) > _WIDEST:
-        line = f"training images are {degrees:.0f} degrees wide, as if focal lengths were in millimetres"
-        yield f"{line}; write them in pixels"
+        line = f"training images are {degrees:.0f} degrees wide, as if focal lengths were not in pixels"
+        yield f"{line}; {IN_PIXELS}"
 
 
 def _of_other_shape(width: int, height: int, across: float, down: float) -> str | None:
