@@ -18,6 +18,7 @@ from pathlib import Path
 from reprlib import repr as short
 from typing import BinaryIO
 from unicodedata import category, normalize
+from urllib.parse import unquote
 
 from forewarp.files import MOST_BYTES, check_size, load_json
 
@@ -204,7 +205,8 @@ def inside(folder: Path, name: object, where: str) -> Path:
     """Join a path to ``folder``; refuse one that leads out of it.
 
     Judged by the text alone, so a folder may link to where its images really are. A backslash separates, as
-    files written on Windows have it. A file whose name is there in another Unicode form is that.
+    files written on Windows have it. A file whose name is there in another Unicode form is that, as is one
+    that is only there without the escapes of URLs, ``%20``.
     """
     is_text = isinstance(name, str) and not any(category(c) in _UNPRINTABLE for c in name)
     normal = os.path.normpath(name.replace("\\", "/")) if is_text and name else ".."
@@ -214,7 +216,16 @@ def inside(folder: Path, name: object, where: str) -> Path:
     is_drive = re.match("[A-Za-z]:", normal)  # of Windows
     if is_drive or os.path.isabs(normal) or normal.split(os.sep)[0] in ("..", "."):
         raise mismatch(where, "a path inside the scene folder", short(name), _end_inside(folder, normal))
-    return existing(folder / normal)
+    path, plain = existing(folder / normal), unquote(normal)
+    if "%" in normal and "%" not in plain and not _is_image(path):
+        with suppress(SceneError):
+            path = found if _is_image(found := inside(folder, plain, where)) else path
+    return path
+
+
+def _is_image(path: Path) -> bool:
+    """Tell whether a file is there, with or without the suffix of an image."""
+    return any(os.path.isfile(f"{path}{suffix}") for suffix in ("", *SUFFIXES))
 
 
 def _end_inside(folder: Path, path: str) -> str:
@@ -222,7 +233,7 @@ def _end_inside(folder: Path, path: str) -> str:
     parts = [part for part in path.split(os.sep) if part not in ("", "..", ".")]
     ends = (os.path.join(*parts[i:]) for i in range(len(parts)))
     for end in ends:
-        if any((folder / f"{end}{suffix}").is_file() for suffix in ("", *SUFFIXES)):
+        if _is_image(folder / end):
             return f"{end} is there: write paths from the scene's folder on"
     return ""
 
