@@ -112,12 +112,24 @@ def read_frames(
         camera = camera_of(entry, header.size, scale, path, pose=pose, longer=longer)
         time = entry.number("time", -_MOST_TIME, _MOST_TIME) if "time" in entry.own else None
         images.append(ListedImage(entry, path, header, camera, time))
+    assumed += _beside_images(there, file)
     assumed += unread + exif_turned([image.path for image in images if image.header.is_turned], file)
     keys = [] if any("time" in entry.own for entry in entries) else _TIMES
     like_times = [key for key in keys if all(type(entry.own.get(key)) in (int, float) for entry in entries)]
     for key in like_times[:1]:
         assumed.append(f"{file}: {key} of the frames is not read; call it time, if it is that")
     return images, assumed + left_aside((image.entry, image.camera) for image in images)
+
+
+def _beside_images(images: Iterable[tuple[Entry, Path]], file: Path) -> list[str]:
+    """Say in a line where a path without a suffix has images of two kinds."""
+    for entry, path in images:
+        if Path(entry.get("file_path")).suffix not in SUFFIXES:
+            others = [path.with_suffix(s) for s in SUFFIXES if s.lower() != path.suffix.lower()]
+            if other := next((other for other in others if os.path.isfile(other)), None):
+                line = f"{path.name} is read, not {other.name} beside it, as file_path has no suffix"
+                return [f"{file}: {line}; write that which is meant, or remove the other images"]
+    return []
 
 
 def unread_beside(
