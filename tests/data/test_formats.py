@@ -171,7 +171,7 @@ BAD = {
     ],
     "video": [
         ("images/frame_1.png", np.zeros((20, 30, 4), np.uint8), "alpha: expected one in all frames or"),
-        (FRAMES, lambda c: c.update(frames=c["frames"][:1]), "a frame to test on, but got none of 1"),
+        (FRAMES, lambda c: c.update(frames=c["frames"][:1]), "at least 3 images, one of them to test"),
         (FRAMES, {"frames.1.file_path": "./images/frame_1.png"}, "expected each image once, but got imag"),
         (FRAMES, {"frames.1.mask_path": "images/frame_1.png"}, "mask_path: expected one in all .*1 of"),
         (FRAMES, lambda c: [e.update(mask_path="m.png") for e in c["frames"]], "m.png: expected 30 x 20 "),
@@ -194,7 +194,17 @@ BAD = {
         (FRAMES, {"aabb": [[0, 0, 1], [1, 1, 0]]}, "aabb: expected .* each low end below its high end"),
         (FRAMES, {"test_filenames": "images/frame_1.png"}, "test_filenames: expected a list of paths"),
         (FRAMES, {"test_filenames": ["images/x.png"]}, "test_filenames: expected paths of frames.*images/x"),
-        (FRAMES, dict.fromkeys(["train_filenames", "test_filenames"], ["images/frame_1"]), "share none"),
+        (
+            FRAMES,
+            dict.fromkeys(["train_filenames", "test_filenames"], ["images/frame_1"]),
+            "expected train_filenames and test_filenames that share no file, but got images/frame_1 in both",
+        ),
+        (
+            FRAMES,
+            {"val_filenames": ["frame_1.png", "frame_2"], "test_filenames": ["images/frame_1.png"]},
+            "expected val_filenames and test_filenames that share no file",
+        ),
+        (FRAMES, {"test_filenames": ["other/frame_1.png"]}, "test_filenames: expected paths of frames"),
     ],
     "dome": [
         (POSES, b" \n", "expected at least one camera"),

@@ -3,6 +3,7 @@
 import json
 import logging
 import re
+import shutil
 import unicodedata
 from dataclasses import replace
 
@@ -209,6 +210,48 @@ def test_lists_choose_the_splits(tmp_path, made):
     edit(tmp_path / "toy" / FILE, dict.fromkeys(["val_filenames", "test_filenames"], GONE))
     edit(tmp_path / "toy" / FILE, {"train_filenames": ["./images/frame_1", "images/frame_2.png"]})
     assert [len(s) for s in (read_scene(tmp_path, "toy").train, read_scene(tmp_path, "toy").test)] == [2, 8]
+
+
+def test_a_list_of_validation_that_equals_the_test_list_is_both(tmp_path, made):
+    made()
+    listed = ["images/frame_3.png", "images/frame_4.png"]
+    edit(tmp_path / "toy" / FILE, dict.fromkeys(["val_filenames", "test_filenames"], listed))
+    scene = read_scene(tmp_path, "toy")
+    assert [f.name for f in scene.val] == [f.name for f in scene.test] == ["images/frame_3", "images/frame_4"]
+    assert len(scene.train) == 8
+    assert any("validation is on the test frames" in line for line in scene.protocol["assumed"])
+
+
+def test_lists_may_have_the_last_parts_of_paths_where_these_tell_one_frame(tmp_path, made):
+    made()
+    file = tmp_path / "toy" / FILE
+    edit(file, {"test_filenames": ["frame_3.png", "frame_4"]})
+    assert [f.name for f in read_scene(tmp_path, "toy").test] == ["images/frame_3", "images/frame_4"]
+    shutil.copytree(tmp_path / "toy/images", tmp_path / "toy/more")
+    edit(file, {"frames.0.file_path": "more/frame_3.png"})
+    with refused("'frame_3', which is images/frame_3 or more/frame_3; write the whole path"):
+        read_scene(tmp_path, "toy", name_pattern=r"(?P<part>\w+)/frame_(?P<frame>\d+)")
+
+
+def test_paths_with_the_escapes_of_urls_are_read(tmp_path, made):
+    made()
+    (tmp_path / "toy/images").rename(tmp_path / "toy/my images")
+    file = tmp_path / "toy" / FILE
+    edit(
+        file,
+        lambda c: [f.update(file_path=f["file_path"].replace("images", "my%20images")) for f in c["frames"]],
+    )
+    assert all(f.name.startswith("my images/") for f in read_scene(tmp_path, "toy").train)
+
+
+def test_which_of_two_images_of_one_name_is_read_is_said(tmp_path, made):
+    made()
+    file = tmp_path / "toy" / FILE
+    edit(file, lambda c: [f.update(file_path=f["file_path"].removesuffix(".png")) for f in c["frames"]])
+    assert not any("beside it" in line for line in read_scene(tmp_path, "toy").protocol["assumed"] or [])
+    shutil.copy(tmp_path / "toy/images/frame_2.png", tmp_path / "toy/images/frame_2.jpg")
+    lines = read_scene(tmp_path, "toy").protocol["assumed"]
+    assert any("frame_2.png is read, not frame_2.jpg beside it" in line for line in lines)
 
 
 def test_where_no_listed_test_image_was_rendered_training_images_are_held_out(tmp_path, made):

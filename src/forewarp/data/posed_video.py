@@ -19,6 +19,7 @@ import os
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 from pathlib import Path
 from reprlib import repr as short
 
@@ -208,6 +209,8 @@ def read_scene(
     parts, how = {"train": entries, "val": [], "test": []}, "cameras and moments held out by name"
     if not by_name:
         parts, how = _split_entries(file, content, entries, test_every, absent)
+    if parts["val"] and parts["val"] == parts["test"]:
+        assumed.append(f"{file}: val_filenames equals test_filenames: validation is on the test frames")
     check_times({split: {e.name: given[e.name] for e in part} for split, part in parts.items()}, str(file))
     near, far = number_or_none(near, "data.near"), number_or_none(far, "data.far", 1 / MOST_UNITS)
     near = number_or_none(content.get("near"), f"{file}: near") if near is None else near
@@ -427,14 +430,20 @@ def _split_entries(
         absent: names of frames without an image, which a list may have.
 
     Raises:
-        SceneError: for a list that names no frame or one of another list, and where a split is empty.
+        SceneError: for a list that names no frame or one of another list, but for equal val and test lists,
+            and where a split is empty.
     """
     listed = [split for split in SPLITS if f"{split}_filenames" in content]
     if listed:
         names = {split: _listed(file, content, f"{split}_filenames", entries, absent) for split in listed}
         everywhere = set().union(*names.values())
-        if sum(map(len, names.values())) > len(everywhere):
-            raise mismatch(file, "lists of filenames that share none", "one in two of them")
+        is_both = "val" in names and names["val"] == names.get("test")
+        pairs = [pair for pair in combinations(listed, 2) if not (is_both and pair == ("val", "test"))]
+        for one, other in pairs:
+            if both := names[one] & names[other]:
+                lists, got = f"{one}_filenames and {other}_filenames", f"{min(both)} in both"
+                advice = "remove it from one" if len(both) == 1 else f"remove all {len(both)} from one"
+                raise mismatch(file, f"{lists} that share no file", got, advice)
         parts = {split: [e for e in entries if e.name in names.get(split, ())] for split in SPLITS}
         for home in [split for split in ("train", "test") if split not in listed][:1]:
             parts[home] = [entry for entry in entries if entry.name not in everywhere]
@@ -457,14 +466,22 @@ def _split_entries(
 
 
 def _listed(file: Path, content: dict, key: str, entries: list[ImageEntry], absent: set[str]) -> set[str]:
-    """Read the frame names in the list of paths ``content[key]``; refuse names that are no frame."""
+    """Read the frame names in the list of paths, or of their last parts where these tell one frame, at
+    ``content[key]``; refuse names that are no frame.
+    """
     value, where = content[key], f"{file}: {key}"
     if not isinstance(value, list):
         raise mismatch(where, "a list of paths", short(value))
     names = {_name_of(file.parent, path, f"{where}[{i}]") for i, path in enumerate(value)}
-    if unknown := sorted(names - absent - {entry.name for entry in entries}):
-        raise mismatch(where, "paths of frames", short(unknown[0]))
-    return names
+    frames, last = absent | {entry.name for entry in entries}, {}
+    for frame in sorted(frames):
+        last.setdefault(os.path.basename(frame), []).append(frame)
+    found = {name: [name] if name in frames else last.get(name, []) for name in names}
+    for name in sorted(names):
+        if len(found[name]) != 1:
+            like = f", which is {' or '.join(found[name][:2])}; write the whole path" if found[name] else ""
+            raise mismatch(where, "paths of frames", short(name) + like)
+    return {frame for (frame,) in found.values()}
 
 
 def _bounds(file: Path, content: dict, box: Sequence[float] | None) -> Box | None:
