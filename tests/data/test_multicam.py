@@ -181,6 +181,20 @@ def set_to(row, column, value):
     return rows(change)
 
 
+def called(names):
+    """Give the cameras other names; those of films are of empty ones."""
+
+    def rename(folder):
+        for name, place in zip(names, sorted(folder.glob("cam*")), strict=True):
+            if "." in name:
+                shutil.rmtree(place)
+                (folder / name).touch()
+            else:
+                place.rename(folder / name)
+
+    return rename
+
+
 BAD = [
     (rows(lambda a: a[:2]), rf"{FILE}: expected a row for each of 3 cameras, cam00 to cam02, but got 2 rows"),
     (rows(lambda a: a[:, :15]), r"npy: expected 17 numbers for each camera, but got shape \(3, 15\)"),
@@ -192,6 +206,15 @@ BAD = [
     (set_to(2, 16, 3), r"row 2 \(cam02\): bounds: expected 0 < near < far, but got 14 and 3"),
     (set_to(2, 9, 50), "cam02: expected 50 x 32 or 25 x 16 pixels as .* say, but got 48 x 32"),
     (lambda folder: [shutil.rmtree(place) for place in folder.glob("cam*")], "a video for each camera"),
+    (
+        called(["left", "middle", "right"]),
+        "3 of other names, as left; rename them to cam00, cam01 .. in the order of the rows of poses",
+    ),
+    (
+        called(["GX010042.MP4", "GX010043.MP4", "GX010044.MP4"]),
+        "as GX010042.MP4; rename them to cam00.MP4, cam",
+    ),
+    (called(["192.168.1.95.mp4", "192.168.1.96.mp4", "192.168.1.100.mp4"]), "as 192.168.1.95.mp4; rename"),
     (written("cam01/0003.png", (16, 24)), "0003.png: expected 48 x 32 pixels as the first, but got 24 x 16"),
     (
         lambda folder: (folder / "cam01" / "0003.png").rename(folder / "cam01" / "0013.png"),

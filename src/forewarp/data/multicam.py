@@ -226,9 +226,16 @@ def _paths(folder: Path) -> dict[str, Path]:
         found |= {} if inner is None else {path.name: inner}
     if not found:
         expected = "a video for each camera, cam00.mp4, or a folder of its frames, cam00/"
-        is_other = layout_of(folder) == "LLFF"
-        advice = "of images/ by one camera that moves: use experiment=video_with_poses" if is_other else ""
-        raise mismatch(folder, expected, "neither", advice)
+        there = [path for path in folder.glob("[!.]*") if path.suffix.lower() in VIDEOS]
+        there = there or [path for path in folder.glob("[!.]*/") if _images(path) or _images(path / "images")]
+        got, advice = "neither", ""
+        if layout_of(folder) == "LLFF":
+            advice = "of images/ by one camera that moves: use experiment=video_with_poses"
+        elif there:
+            first, kind = in_order(path.name for path in there)[0], there[0].suffix
+            got = f"{len(there)} of other names, as {first}"
+            advice = f"rename them to cam00{kind}, cam01{kind} .. in the order of the rows of {FILE}"
+        raise mismatch(folder, expected, got, advice)
     return {name: found[name] for name in in_order(found)}
 
 
