@@ -41,6 +41,7 @@ def test_one_reading_of_intrinsics(keys, fx, fy, cx):
 
 
 MATRIX = [[80.0, 0, 40], [0, 81, 20], [0, 0, 1]]
+TRANSPOSED = [list(column) for column in zip(*MATRIX)]
 FOUR = [[80.0, 0, 40, 0], [0, 81, 20, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
 
 
@@ -91,6 +92,25 @@ def test_an_angle_of_upright_images_is_of_the_width_or_as_told():
         ({"fl_x": 80, "k5": 0.1}, "k5: expected 0, but got 0.1; undistort"),
         ({"fl_x": 80, "distortion_params": [0.1, 0, 0, 0, 0, 0]}, "params: expected a lens as k1 k2"),
         ({}, "expected fl_x or camera_angle_x, but got neither"),
+        (
+            {"intrinsics": TRANSPOSED},
+            r"intrinsics: expected .* last row 0 0 1, but got \[\[80.*; transpose it",
+        ),
+        ({"camera_intrinsics": sum(TRANSPOSED, [])}, "camera_intrinsics: expected .*; transpose it"),
+        ({"intrinsics": [80, 80, 40, 30]}, r"intrinsics: .*got \[80, 80, 40, 30\]; write it as fl_x, fl_y"),
+        ({"K": {"fx": 80}}, "K: expected fl_x or camera_angle_x, .*; write it as fl_x, fl_y, cx and cy"),
+        ({"fov_x": 50}, "fov_x: expected fl_x or camera_angle_x, .*; call it camera_angle_x, in radians"),
+        ({"vfov": 50}, "vfov: .*; call it camera_angle_y, in radians"),
+        ({"fx": 80}, "fx: expected fl_x or .*; call it fl_x, in pixels"),
+        ({"camera_angle_x": 50}, "expected radians .*, but got 50; if it is in degrees, write 0.872665"),
+        (
+            {"fl_x": 0.5},
+            "fl_x: expected a focal length in pixels, .* but got 0.5; if fl_x is in millim.* by w",
+        ),
+        ({"fl_x": 1.07, "cx": 0.5, "cy": 0.5}, "shares of the size: multiply cx and fl_x by the width"),
+        ({"fl_x": "80"}, "fl_x: expected a number .*got '80'; write it without quotes"),
+        ({"fl_x": 80, "w": 160, "h": 120}, "but got 80 x 60; multiply w, h, fl_x, fl_y, cx and cy by 0.5"),
+        ({"fl_x": 80, "w": 100, "h": 60}, "but got 80 x 60; write w and h of the images"),
         ({"camera_angle_y": 0.0}, r"camera_angle_y: expected radians inside \(0, pi\)"),
         ({"fl_x": 80, "lens_model": "OPENCV_FISHEYE"}, "lens_model: expected a pinhole camera"),
         ({"fl_x": 80, "common": {"camera_type": "PANO"}}, r"camera_type: .*pinhole camera, but got 'PANO'"),
@@ -386,3 +406,16 @@ def test_what_other_programs_leave_names_the_way(tmp_path, file, said):
     for reader in (dnerf, posed_video):
         with refused(said):
             reader.read_scene(tmp_path, "toy")
+
+
+@pytest.mark.parametrize(
+    ("matrix", "said"),
+    [
+        (np.eye(4).flatten().tolist(), "write it as four rows of four numbers"),
+        (np.eye(4)[:3].flatten().tolist(), "write it as three rows of four numbers"),
+        (np.eye(4).astype(str).tolist(), "write its numbers without quotes"),
+    ],
+)
+def test_poses_written_in_another_way_are_refused_with_the_mend(matrix, said):
+    with refused(f"transform_matrix: expected 4 x 4 or 3 x 4 finite numbers, but got .*; {said}"):
+        pose_in(Entry("t.json", {"transform_matrix": matrix}), None, False)

@@ -55,7 +55,10 @@ def pose_of(value: object, where: str) -> np.ndarray:
     if matrix.shape == (3, 4) and matrix.dtype.kind in "if":
         matrix = np.concatenate([matrix, [[0, 0, 0, 1]]])
     if matrix.shape != (4, 4) or matrix.dtype.kind not in "if" or not np.isfinite(matrix).all():
-        raise mismatch(where, "4 x 4 or 3 x 4 finite numbers", short(value), "check the export")
+        advice = "write its numbers without quotes" if matrix.dtype.kind == "U" else "check the export"
+        rows = {(16,): "four", (12,): "three"}.get(matrix.shape)
+        advice = f"write it as {rows} rows of four numbers" if rows else advice
+        raise mismatch(where, "4 x 4 or 3 x 4 finite numbers", short(value), advice)
     matrix = matrix.astype(np.float64)
     rotation, largest = matrix[:3, :3], np.abs(matrix).max()
     if largest > MOST_UNITS:

@@ -146,7 +146,8 @@ def number(value: object, where: str, low: float = -inf, high: float = inf) -> f
     # An integer may be beyond every float.
     if not (is_real and abs(value) <= sys.float_info.max and low <= value <= high):
         within = "" if (low, high) == (-inf, inf) else f" in [{low:g}, {high:g}]"
-        raise mismatch(where, f"a number{within}", short(value))
+        is_text = isinstance(value, str) and re.fullmatch(r"\s*[-+]?\d*\.?\d+([eE][-+]?\d+)?\s*", value)
+        raise mismatch(where, f"a number{within}", short(value), "write it without quotes" if is_text else "")
     return float(value)
 
 

@@ -20,11 +20,12 @@ from typing import TypeVar
 import numpy as np
 import torch
 
-from forewarp.data.cameras import FLIP, check_camera, pose_of
+from forewarp.data.cameras import FLIP, IN_PIXELS, check_camera, pose_of
 from forewarp.data.files import (
     SIDE,
     SUFFIXES,
     Entry,
+    SceneError,
     existing,
     frames_of,
     mismatch,
@@ -51,6 +52,8 @@ _PATHS = ("file_path", "mask_path", "depth_file_path", "moving_path", "resting_p
 _READ = {*_PATHS, "depth_scale", *_UNREAD_LENSES}  # or told elsewhere
 # Matrices of intrinsics, as programs call them.
 _INNER = ("cam_K", "K", "intrinsics", "intrinsic", "intrinsic_matrix", "camera_intrinsics", "camera_matrix")
+_LIKE_ANGLE = re.compile("(?i)([hvxy]_?)?(fov|field_of_view)(_?([hvxy]|deg|degrees|rad|vert.*|hor.*))?")
+_LIKE_FOCAL = re.compile("(?i)fx|f|focal(_?len(gth)?)?(_?x)?|flx")
 _FOCAL = ("fl_x", "fl_y", "camera_angle_x")
 _SAME_FOCAL = 0.02  # share by which two focal lengths of one camera may differ
 _OUTSIDE = 0.9  # share of a side beyond which a principal point is another image's
@@ -202,7 +205,12 @@ def camera_of(
     sizes = [entry.number(key, 1, 1e6, n * scale) for key, n in zip("wh", stored)]
     if any(abs(n - size / scale) >= 1 for n, size in zip(stored, sizes)):
         expected = " x ".join(f"{size / scale:g}" for size in sizes)
-        advice = TURN if all(abs(n - size / scale) < 1 for n, size in zip(stored, sizes[::-1])) else ""
+        factors = [n * scale / size for n, size in zip(stored, sizes)]
+        advice = "write w and h of the images, and fl_x, fl_y, cx and cy in their pixels"
+        if all(abs(n - size / scale) < 1 for n, size in zip(stored, sizes[::-1])):
+            advice = TURN
+        elif abs(factors[0] / factors[1] - 1) < _SAME_FOCAL:
+            advice = f"multiply w, h, fl_x, fl_y, cx and cy by {factors[0]:.4g}, or resize the images"
         raise mismatch(image, f"{expected} pixels as {entry.where('w')} and h say", by(stored), advice)
     width, height = map(round, sizes)
     fx = _focal(entry, width, height, longer)
@@ -251,7 +259,10 @@ def _focal(entry: Entry, width: int, height: int, longer: bool) -> float:
     across = "camera_angle_x" if entry.get("camera_angle_x") is not None or named else "camera_angle_y"
     angle = entry.get(across)
     if named is None and angle is None:
-        raise mismatch(entry.where("fl_x"), "fl_x or camera_angle_x", "neither")
+        raise _no_focal(entry)
+    if is_number(angle) and math.pi < angle < 180:
+        advice = f"if it is in degrees, write {math.radians(angle):.6g}"
+        raise mismatch(entry.where(across), "radians inside (0, pi)", angle, advice)
     if angle is not None:
         angle = entry.number(across, 0, math.pi)
         if angle in (0, math.pi):
@@ -261,6 +272,9 @@ def _focal(entry: Entry, width: int, height: int, longer: bool) -> float:
         return height / half
     if named is None:
         return (max(width, height) if longer else width) / half
+    if is_number(focal := entry.get(named)) and 0 < focal < least:
+        expected = f"a focal length in pixels, of {least:g} to {most:g}"
+        raise mismatch(entry.where(named), expected, focal, IN_PIXELS.replace("fl_x", named))
     focal = entry.number(named, least, most)
     same_place = ("camera_angle_x" in entry.own) == (named in entry.own)
     agrees = half is None or any(abs(side / half / focal - 1) < _SAME_FOCAL for side in (width, height))
@@ -270,6 +284,33 @@ def _focal(entry: Entry, width: int, height: int, longer: bool) -> float:
         got = f"{angle:.4g} ({math.degrees(angle):.1f} degrees)"
         raise mismatch(entry.where("camera_angle_x"), expected, got, "remove the one that is wrong")
     return focal
+
+
+def _no_focal(entry: Entry) -> SceneError:
+    """Make the error that a camera has no focal length, naming a key that seems to tell it in another way."""
+    for key, value in {**entry.common, **entry.own}.items():
+        where, expected = entry.where(key), "fl_x or camera_angle_x"
+        if _intrinsics(_transposed(value)) is not None:
+            return mismatch(where, "intrinsics with the last row 0 0 1", short(value), "transpose it")
+        if key in _INNER and value is not None:
+            advice = "write it as fl_x, fl_y, cx and cy, in pixels"
+            return mismatch(where, expected, short(value), advice)
+        if _LIKE_ANGLE.fullmatch(key):
+            down = "y" if re.search("(?i)^(v|y)|(v|y)$|vert", key) else "x"
+            advice = f"call it camera_angle_{down}, in radians"
+            return mismatch(where, expected, f"{key} {short(value)}", advice)
+        if _LIKE_FOCAL.fullmatch(key):
+            return mismatch(where, expected, f"{key} {short(value)}", "call it fl_x, in pixels")
+    return mismatch(entry.where("fl_x"), "fl_x or camera_angle_x", "neither")
+
+
+def _transposed(value: object) -> object:
+    """Transpose 3 x 3, 4 x 3 or 4 x 4 values, or nine in a row; leave others as they are."""
+    if not isinstance(value, list):
+        return None
+    rows = [value[i : i + 3] for i in (0, 3, 6)] if len(value) == 9 else value
+    are_rows = all(isinstance(row, list) and len(row) == len(rows[0]) for row in rows)
+    return [list(column) for column in zip(*rows)] if are_rows else None
 
 
 def with_intrinsics(entries: Sequence[Entry], where: str) -> tuple[list[Entry], list[str]]:
