@@ -162,7 +162,7 @@ def test_the_small_form_writes_the_page_by_make(tmp_path):
 )
 def test_the_small_form_writes_the_page(line, page, ok, in_tmp, monkeypatch):
     """In this process, and of one sweep where all of them would take minutes."""
-    monkeypatch.setattr(reproduce, "LANES", ("methods:dnerf ablation_losses:dnerf", ""))
+    monkeypatch.setattr(reproduce, "COUNTERPARTS", "methods:dnerf ablation_losses:dnerf")
     kind, *typed = shlex.split(line)
     job = plan_of(kind, Keys.typed([*typed, "SMALL=1"]))
     for sweep in (sweep for lane in job.lanes for sweep in lane):
