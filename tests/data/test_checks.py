@@ -135,6 +135,11 @@ def test_what_contradicts_itself_is_told(scene, said):
     assert any(re.search(said, line) for line in remarks(scene))
 
 
+def test_the_order_of_hexadecimal_names_is_not_doubted():
+    names = ["0000", "0001", "0008", "0009", "000a", "000b", "0010", "0011"]
+    assert not any("as texts" in line for line in remarks(changed(train=named(names))))
+
+
 def torso(rows, columns):
     """A silhouette (H, W) that fills shares of the rows and columns, by their ends."""
     row, column = ((torch.arange(30) + 0.5) / 30).expand(2, 30, 30)

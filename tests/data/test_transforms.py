@@ -92,6 +92,7 @@ def test_an_angle_of_upright_images_is_of_the_width_or_as_told():
         ({"fl_x": 80, "k5": 0.1}, "k5: expected 0, but got 0.1; undistort"),
         ({"fl_x": 80, "distortion_params": [0.1, 0, 0, 0, 0, 0]}, "params: expected a lens as k1 k2"),
         ({}, "expected fl_x or camera_angle_x, but got neither"),
+        ({"fl_x": 5, "k1": 0.105, "k2": -0.088}, "k1: .* lens .* images 166 degrees wide; if fl_x is in mil"),
         (
             {"intrinsics": TRANSPOSED},
             r"intrinsics: expected .* last row 0 0 1, but got \[\[80.*; transpose it",

@@ -25,6 +25,7 @@ MOST_UNITS = 1e9  # largest coordinate: farther from the origin single precision
 _LARGER, _SAME_FACTOR = 1.5, 0.1  # of a middle beyond the image's own, which tells a larger image's
 _LEAST_FACTOR, _EXCHANGED = 0.1, 0.05  # of a smaller image's middle; by which exchanged sides may be off
 _FEW_PIXELS = 8  # of a side, which is no image
+WIDEST = 110  # degrees of a pinhole camera, of which phones' widest have 108
 IN_PIXELS = "if fl_x is in millimetres, multiply it by w and divide it by the sensor's width"
 IN_PIXELS += "; if it is a share of the width, multiply it by w"
 SPLITS = ("train", "val", "test")
@@ -114,7 +115,16 @@ def check_lens(camera: Camera, where: str) -> None:
     """
     if camera.lens is not None and not _can_be_undone(*camera.inner):
         got = f"k={camera.lens.k} and p={camera.lens.p}"
-        raise mismatch(where, "a lens that can be undone all over the picture", got, "undistort the images")
+        advice = "undistort the images"
+        if (degrees := degrees_of(camera)) > WIDEST:
+            got += f" of images {degrees:.0f} degrees wide"
+            advice = f"{IN_PIXELS}; else {advice}"
+        raise mismatch(where, "a lens that can be undone all over the picture", got, advice)
+
+
+def degrees_of(camera: Camera) -> float:
+    """Return the angle in degrees that the wider side of a camera's image has without its lens."""
+    return math.degrees(2 * math.atan(max(camera.width / camera.fx, camera.height / camera.fy) / 2))
 
 
 def check_camera(camera: Camera, middle: str, lens: str) -> None:

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Sequence
 
 import torch
 from torch import Tensor
 
-from forewarp.data.cameras import IN_PIXELS, nine_pixels
+from forewarp.data.cameras import IN_PIXELS, WIDEST, degrees_of, nine_pixels
 from forewarp.data.directions import common_point
 from forewarp.data.files import mismatch
 from forewarp.data.images import by
-from forewarp.data.names import in_order
+from forewarp.data.names import hexadecimal, in_order
 from forewarp.scene.box import Box, Lattice
 from forewarp.scene.camera import Camera, focus_point
 from forewarp.scene.frame import Frame, Scene, sightings, spread, walk_of, where_seen
@@ -23,8 +22,7 @@ _EDGE, _LEFT_OUT = 0.9, 0.02  # shares of an inverted image: subject along its e
 _SIDE, _HOLLOW = 0.5, 0.33  # of one whose subject crosses edges: at two opposite ones, in its middle ninth
 _WITHIN = 5  # points along a side of the box that cameras are asked for
 _FAINT = 8  # of 255: alpha that is nowhere above it was written as 0 and 1
-# Degrees of a pinhole camera, of which phones' widest have 108; focal lengths of test and training images.
-_WIDEST, _ZOOMED = 110, 1.25
+_ZOOMED = 1.25  # focal lengths of test and training images
 _ASIDE = 0.25  # share of a side by which a principal point is far from the middle
 _CROPPED, _MIDDLE = 0.08, 0.01  # shares by which one of a crop is off, and the other at most
 _STRETCHED, _SAME_PLACE = 1.25, 1e-9  # sides of a pixel; share of the cameras' distance from the origin
@@ -63,7 +61,7 @@ def remarks(scene: Scene) -> Iterator[str]:
     aside = aside or ([] if aim is None else list(_aimed(scene, aim)))
     yield from aside or _of_test_images(scene)
     names = [frame.name for frame in sorted(scene.train, key=lambda frame: frame.time)]
-    if names == sorted(names) != (numbered := in_order(names)):
+    if names == sorted(names) != (numbered := in_order(names)) and hexadecimal(names) is None:
         got, due = next(pair for pair in zip(names, numbered) if pair[0] != pair[1])
         line = f"times follow the images' names as texts, not their numbers ({got} comes where {due} is due)"
         yield f"{line}; count them in the order of the numbers"
@@ -119,8 +117,7 @@ def _pinholes(scene: Scene) -> Iterator[str]:
     stretched = [frame.camera.fy / frame.camera.fx for frame in scene.train]
     if not 1 / _STRETCHED < (ratio := float(torch.tensor(stretched).median())) < _STRETCHED:
         yield f"pixels are {ratio:.3g} times as wide as high, by their focal lengths; compare both"
-    widest = max(max(f.camera.width / f.camera.fx, f.camera.height / f.camera.fy) for f in scene.train)
-    if (degrees := math.degrees(2 * math.atan(widest / 2))) > _WIDEST:
+    if (degrees := max(degrees_of(frame.camera) for frame in scene.train)) > WIDEST:
         line = f"training images are {degrees:.0f} degrees wide, as if focal lengths were not in pixels"
         yield f"{line}; {IN_PIXELS}"
 

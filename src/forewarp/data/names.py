@@ -189,7 +189,9 @@ def read_names(
     """
     if pattern is not None:
         return _by_pattern(names, where, pattern)
-    _refuse_hexadecimal(names, where)
+    if (name := hexadecimal(names)) is not None:
+        what = "what is beside the numbers differs from image to image, as of hexadecimal numbers"
+        raise _two_ways(where, name, what)
     rows = _of_one_form(_with_days(names), names, where) if names else None
     if rows is None:
         return None
@@ -263,11 +265,15 @@ def _by_pattern(names: Sequence[str], where: str, pattern: str) -> NameNumbers:
     return NameNumbers(frames, cameras, "taken from the images' names by data.name_pattern")
 
 
-def _refuse_hexadecimal(names: Sequence[str], where: str) -> None:
-    """Refuse counters that have letters a to f at the place of digits, as 0009 and 000a, or 9, a and 10."""
+def hexadecimal(names: Sequence[str]) -> str | None:
+    """Find a name whose counter has letters a to f where others have digits; None where there is none.
+
+    >>> hexadecimal(["r_0009", "r_000a"]), hexadecimal(["9", "a", "10"]), hexadecimal(["1a", "1b", "2a"])
+    ('r_000a', 'a', None)
+    """
     fields = [re.split(r"[^0-9A-Za-z]+", name.rpartition("/")[2]) for name in names]
     if len({*map(len, fields)}) > 1:
-        return
+        return None
     for values in zip(*fields):
         prefix = os.path.commonprefix(values).rstrip("0123456789")
         rests = [value.removeprefix(prefix) for value in values]
@@ -279,9 +285,8 @@ def _refuse_hexadecimal(names: Sequence[str], where: str) -> None:
             is_filled = any(len(rest) > 1 and rest[0] == "0" for rest in rests)
             is_mixed = not is_filled and {rest[0].isdigit() for rest in rests} == {True, False}
         if is_mixed:
-            name = next(name for name, rest in zip(names, rests) if not rest.isdigit())
-            what = "what is beside the numbers differs from image to image, as of hexadecimal numbers"
-            raise _two_ways(where, name, what)
+            return next(name for name, rest in zip(names, rests) if not rest.isdigit())
+    return None
 
 
 def _number_of(text: str | None) -> float:
