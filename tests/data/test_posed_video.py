@@ -479,9 +479,7 @@ def test_masks_that_cannot_be_meant_are_refused(tmp_path, masked):
     mask = masked()
     for i in range(10):  # which of two is the subject's?
         write_image(tmp_path / "toy" / "masks" / f"m_{i}.png", np.where(mask, 24, 11).astype(np.uint8))
-    with refused(
-        r"m_\d.png: expected a mask with a bright pixel.*nor labels beside 0; write .* and all else"
-    ):
+    with refused(r"m_\d.png: expected a mask with a bright pixel.*nor labels beside 0; write"):
         read_scene(tmp_path, "toy")
     with refused("data.masks: expected alpha, ignore, off or null, but got 'x'"):
         read_scene(tmp_path, "toy", masks="x")

@@ -16,6 +16,8 @@ SIDE = 64  # pixels of the longer side of images that are compared
 _PLANES, _NEIGHBOURS, _PATCH = 32, 2, 3
 _TEXTURED = 0.02  # deviation of grey in [0, 1] around a pixel, below which any depth fits it
 _LEAST_PIXELS, _SAMPLES = 100, 2000  # of a pair of views: fewest that tell, most that are looked at
+_APART = 1e-3  # least difference of two readings, as a share, that tells
+_OCCLUDED, _OUTLIER = 0.15, 4.0  # share and multiple of the median error from which another thing is seen
 
 
 def photo_error(cameras: Sequence[Camera], images: Sequence[Tensor]) -> float:
@@ -65,37 +67,70 @@ def _swept(camera: Camera, image: Tensor, other: Camera, shown: Tensor) -> Tenso
     return difference[textured & difference.isfinite()]
 
 
-def disagreement(
-    cameras: Sequence[Camera], distances: Sequence[Tensor], known: Tensor | None = None
-) -> float | None:
-    """Return the share by which distances of several views contradict each other, in the median of all pairs.
+def leaning(
+    cameras: Sequence[Camera], readings: Sequence[Sequence[Tensor]], known: Tensor | None = None
+) -> tuple[float, float, float] | None:
+    """Compare two readings of the distances of several views by how far pairs of views contradict each other.
+
+    Where the first is right its errors are noise; where the second is, they follow the difference of both
+    readings' errors, however small it is beside the noise.
 
     Args:
         cameras: of the views.
-        distances: (H, W) along the rays of each, 0 where there is none.
+        readings: two, of (H, W) along the rays of each view, 0 where there is none.
         known: points (N, 3) that the views are compared with, too.
 
     Returns:
-        None where no two views show enough of the same, and none enough of what is known.
+        about 0 where the first is right and 1 where the second is, and the share by which distances of each
+        differ, medians of all pairs; None where no two views show enough of the same in which both differ.
     """
-    clouds = []
-    for camera, away in zip(cameras, distances):
-        there = away.flatten().nonzero()[:, 0]
+    clouds = []  # of both readings, for each view
+    for camera, *both in zip(cameras, *readings):
+        there = (both[0] * both[1]).flatten().nonzero()[:, 0]
         there = there[:: max(1, len(there) // _SAMPLES)]
         rays = camera.rays(there, torch.float64)
-        clouds.append(rays.origins + away.flatten()[there].double()[:, None] * rays.directions)
+        away = [distances.flatten()[there].double()[:, None] for distances in both]
+        clouds.append([rays.origins + n * rays.directions for n in away])
     pairs = [(clouds[k], view) for k, view in permutations(range(len(cameras)), 2)]
-    pairs += [] if known is None else [(known, view) for view in range(len(cameras))]
-    shares = [_off(cameras[view], distances[view], points) for points, view in pairs]
-    medians = [float(share.median()) for share in shares if len(share) >= _LEAST_PIXELS]
-    return median(medians) if medians else None
+    pairs += [] if known is None else [([known, known], view) for view in range(len(cameras))]
+    found = [_lean(cameras[view], [given[view] for given in readings], both) for both, view in pairs]
+    found = [of_pair for of_pair in found if of_pair is not None]
+    return tuple(map(median, zip(*found))) if found else None
 
 
-def _off(camera: Camera, distances: Tensor, points: Tensor) -> Tensor:
-    """Return the shares (P,) by which distances (H, W) of a view differ from those of points that it sees."""
-    pixel, z = camera.project(points.double())
-    size = pixel.new_tensor([camera.width, camera.height])
-    inside = (z > 0) & (pixel >= 0).all(-1) & (pixel < size).all(-1)
-    column, row = pixel[inside].long().unbind(-1)
-    given, true = distances[row, column].double(), (points[inside].double() - camera.center).norm(dim=-1)
-    return ((given - true).abs() / true)[given > 0]
+def _lean(
+    camera: Camera, given: Sequence[Tensor], points: Sequence[Tensor]
+) -> tuple[float, float, float] | None:
+    """Fit by which share of their difference the errors of two readings (H, W) of a view are off.
+
+    Args:
+        camera: of the view.
+        given: both readings.
+        points: (P, 3) of another view by both readings. Each pair is looked up in one pixel, so that the
+            noise of both is one and their difference has none.
+
+    Returns:
+        the share, and the size of both errors, as shares of the distance; None where the view does not show
+        enough of the points.
+    """
+    middle, z = camera.project((points[0] + points[1]).double() / 2)
+    inside = (
+        (z > 0) & (middle >= 0).all(-1) & (middle < middle.new_tensor([camera.width, camera.height])).all(-1)
+    )
+    column, row = middle[inside].long().unbind(-1)
+    first, second = (
+        distances[row, column].double() / (cloud[inside].double() - camera.center).norm(dim=-1) - 1
+        for distances, cloud in zip(given, points)
+    )
+    off = ((first + second) / 2).abs()
+    off[given[0][row, column] <= 0] = torch.inf
+    kept = off <= _OCCLUDED
+    if len(off) == 0 or int(kept.sum()) < max(_LEAST_PIXELS, len(off) / 2):
+        return None
+    first, second, off = first[kept], second[kept], off[kept]
+    near = off <= _OUTLIER * off.median()
+    apart = (first - second)[near]
+    if float(apart.square().mean().sqrt()) < _APART:
+        return None
+    share = float((first[near] * apart).sum() / apart.square().sum())
+    return share, float(first.abs().median()), float(second.abs().median())

@@ -11,12 +11,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from forewarp.data.agreement import disagreement
+from forewarp.data.agreement import leaning
 from forewarp.data.arrays import check_shape, load_numpy
 from forewarp.data.files import existing, mismatch
 from forewarp.data.images import CACHE, by, read_gray16, read_image
 from forewarp.scene.camera import Camera, Lens
-from forewarp.scene.frame import spread
+from forewarp.scene.frame import Frame, spread
 
 SUFFIXES = (".npy", ".png")
 MILLIMETRES = 1e-3
@@ -24,7 +24,12 @@ METRIC = ("axis", "ray")  # kinds of depth in a unit of length
 LEVELS = 2  # of ARKit's confidence: 0 low, 1 medium, 2 high
 _LOOKED_AT = 4  # files that tell the unit
 _NEAR, _LEAST, _AGREE, _LINES = 0.05, 10, 0.4, 400  # of a fit: share, points, share of them, lines tried
-_VIEWS, _OFF, _BETTER = 6, 0.01, 0.5  # that are compared; error that tells, and a better one as a share of it
+_VIEWS, _NEXT = 4, (0, 2, 6, 14)  # views that are compared, with others so many later
+_LEANS = 0.65, 1.5  # between which the other kind is right
+    4,
+    (0, 2, 6, 14),
+    (0.65, 1.5),
+)  # views that are compared with later ones; share that tells
 _BEYOND = 2.0  # share of near and far within which the median of depths of the right unit lies
 
 
@@ -123,28 +128,41 @@ def line_through(given: np.ndarray, true: np.ndarray) -> tuple[float, float] | N
     return float(a), float(b)
 
 
-def refuse_other_kind(depths: Sequence[SensedDepth], known: Tensor | None, where: object) -> None:
-    """Refuse depth taken for that along the axis of which views agree much better if it is along the rays.
+def doubt_kind(frames: Sequence[Frame], known: Tensor | None, kind: str | None, where: object) -> list[str]:
+    """Doubt that depth is along the axis, or along the rays, where views agree with the other: refuse it, or
+    say so in a line if the kind was typed.
 
     Args:
-        depths: of images, of which some are read.
+        frames: in the order of time; some of those with depth are read, less what moves where that is known.
         known: points (N, 3) that never move, world units.
+        kind: as typed; None is the axis.
         where: of the error.
 
     Raises:
         SceneError: naming the key.
     """
-    some, errors = [depths[i] for i in spread(len(depths), _VIEWS)], {}
-    for kind in METRIC:
-        planes = [replace(depth, kind=kind)()[0] for depth in some]
-        errors[kind] = disagreement([depth.camera for depth in some], planes, known)
-    axis, ray = (errors[kind] for kind in METRIC)
-    if axis is not None and ray is not None and axis > _OFF and ray < _BETTER * axis:
-        got = (
-            f"depths of which views differ by {axis:.1%}, and by {ray:.1%} if they are along the pixels' rays"
-        )
-        advice = "set data.depth_kind=ray, or data.depth_kind=axis if they are right"
-        raise mismatch(where, "depths along the optical axis", got, advice)
+    frames = [frame for frame in frames if frame.load_sensed is not None]
+    if kind not in (*METRIC, None) or not frames:
+        return []
+    chosen = sorted({i + n for i in spread(len(frames), _VIEWS) for n in _NEXT if i + n < len(frames)})
+    some, taken = [frames[i] for i in chosen], kind or METRIC[0]
+    other = METRIC[1 - METRIC.index(taken)]
+    readings = [[_still(frame, each) for frame in some] for each in (taken, other)]
+    found = leaning([frame.camera for frame in some], readings, known)
+    if found is None or not _LEANS[0] < found[0] < _LEANS[1] or found[2] > found[1]:
+        return []
+    along = {"axis": "along the optical axis", "ray": "along the pixels' rays"}
+    got = f"depths of which views differ by {found[1]:.2%}, and by {found[2]:.2%} if they are {along[other]}"
+    if kind is None:
+        advice = f"set data.depth_kind={other}, or data.depth_kind={taken} if they are right"
+        raise mismatch(where, f"depths {along[taken]}", got, advice)
+    return [f"{where}: {got}; unless data.depth_kind={taken} is right, set data.depth_kind={other}"]
+
+
+def _still(frame: Frame, kind: str) -> Tensor:
+    """Return distances (H, W) along the rays, taken for a kind of depth, 0 where something moves."""
+    away = replace(frame.load_sensed, kind=kind)()[0]
+    return away if frame.load_moving is None else away * ~frame.load_moving()
 
 
 def depths_beside(folder: Path, names: Sequence[str]) -> dict[str, Path]:

@@ -31,7 +31,7 @@ from torch import Tensor
 from forewarp.data import files
 from forewarp.data.arrays import read_cloud, read_truth, write_array, write_truth
 from forewarp.data.cameras import MOST_UNITS, Normalisation, box_of, check_camera, frustum_box, pose_of
-from forewarp.data.depth import METRIC, SensedDepth, depths_beside, refuse_other_kind, unit_of
+from forewarp.data.depth import METRIC, SensedDepth, depths_beside, doubt_kind, unit_of
 from forewarp.data.directions import by_translation, opposite, other_readings, transposed
 from forewarp.data.files import (
     Entry,
@@ -188,8 +188,7 @@ def read_scene(
         return Frame(item, time, camera, load, camera_id=camera_ids[item], **options)
 
     train, test = (tuple(map(frame, items)) for items in (train_ids, test_ids))
-    if depths and depth_kind is None:
-        refuse_other_kind([f.load_sensed for f in train if f.load_sensed], None, folder / depth)
+    assumed += doubt_kind(train, None, depth_kind, folder / (depth or ""))
     splits = {"train": train_ids, "val": test_ids}
     numbered = {split: {item: numbers[item] for item in items} for split, items in splits.items()}
     check_times(numbered, str(folder / "metadata.json"))

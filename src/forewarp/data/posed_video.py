@@ -37,7 +37,7 @@ from forewarp.data.depth import (
     confidence_of,
     depths_beside,
     depths_named,
-    refuse_other_kind,
+    doubt_kind,
 )
 from forewarp.data.directions import check_directions
 from forewarp.data.files import (
@@ -256,8 +256,7 @@ def read_scene(
         return Frame(e.name, e.time, camera, e.load, **beside, camera_id=camera_id, moment=e.moment)
 
     train, val, test = (tuple(map(frame, parts[split])) for split in SPLITS)
-    if depths and depth_kind is None:
-        refuse_other_kind([f.load_sensed for f in train if f.load_sensed], still, place or file)
+    assumed += doubt_kind(train, still, depth_kind, place or file)
     ranks = {time: n for n, time in enumerate(sorted({*times}))}
     moments = {e.name: ranks[e.time] if e.moment is None else e.moment for e in entries}
     held = held_cameras(test_cameras, views, []), held_moments(test_moments, max(moments.values()) + 1)
