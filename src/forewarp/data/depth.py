@@ -26,10 +26,6 @@ _LOOKED_AT = 4  # files that tell the unit
 _NEAR, _LEAST, _AGREE, _LINES = 0.05, 10, 0.4, 400  # of a fit: share, points, share of them, lines tried
 _VIEWS, _NEXT = 4, (0, 2, 6, 14)  # views that are compared, with others so many later
 _LEANS = 0.65, 1.5  # between which the other kind is right
-    4,
-    (0, 2, 6, 14),
-    (0.65, 1.5),
-)  # views that are compared with later ones; share that tells
 _BEYOND = 2.0  # share of near and far within which the median of depths of the right unit lies
 
 
