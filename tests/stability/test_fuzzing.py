@@ -354,7 +354,7 @@ def of_files(root):
             shutil.rmtree(root / "captured", ignore_errors=True)
             capture_record3d(scan, root / "captured", step, "capture.json")
 
-        found["r3d"] = (capture, SceneError)
+        found["r3d"] = (capture, (SceneError, OSError))
     return found
 
 

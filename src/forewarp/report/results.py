@@ -335,8 +335,15 @@ def read_run(folder: Path) -> Row:
     row |= {"minutes": budget["minutes"], "iterations": budget.get("iterations")}
     row |= {"clock": protocol.get("clock") or budget.get("clock") or "wall"}
     copied = ("threads", "device", "commit", "departures", "faults", "train_views")
-    row |= {name: protocol.get(name) for name in copied}
-    row |= {"torch": protocol.get("versions", {}).get("torch"), "held_out": protocol.get("held_out") or None}
+    row |= {name: protocol.get(name) for name in copied} | {
+        "torch": protocol.get("versions", {}).get("torch")
+    }
+    kinds = {str: "text", int | float: "number"}
+    for name, kind in {"device": str, "torch": str, "commit": str, "threads": int | float}.items():
+        if not isinstance(row[name], kind | None):
+            got = f"{row[name]!r:.80}; measure the run again"
+            raise ValueError(f"{folder / 'metrics.json'}: {name}: expected a {kinds[kind]}, but got {got}")
+    row |= {"held_out": protocol.get("held_out") or None}
     row |= {"measured": protocol.get("measured", f"all {frames} test views" if frames else None)}
     row |= {"tested": int(tested) if tested.isdigit() else None}  # as of "10 of 30 test views, evenly spread"
     row |= {"counterpart": synthetic, "dataset": COUNTERPART * stands_in + dataset}
