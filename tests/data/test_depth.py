@@ -5,7 +5,7 @@ import pytest
 import torch
 from PIL import Image
 
-from forewarp.data.depth import SensedDepth, confidence_of, depths_beside, line_through
+from forewarp.data.depth import SensedDepth, confidence_of, depths_beside, line_through, read_depth
 from forewarp.data.posed_video import FILE, read_scene
 from forewarp.scene.camera import Camera
 from tests.support.written_scenes import edit, refused, write_video
@@ -49,6 +49,18 @@ def test_scale_and_shift_follow_from_known_points(tmp_path, kind, shift):
         assert not SensedDepth(tmp_path / "a.npy", camera, **given | {"known": few})().any()
 
 
+def test_the_largest_number_of_a_png_is_a_hole_and_one_channel_may_come_first(tmp_path):
+    values = np.full((6, 8), 2000, np.uint16)
+    values[:2] = 65535
+    Image.fromarray(values).save(tmp_path / "a.png")
+    np.save(tmp_path / "a.npy", values[None])
+    for name in ("a.png", "a.npy"):
+        assert np.array_equal(read_depth(tmp_path / name), np.where(values == 2000, 2000.0, 0.0))
+    np.save(tmp_path / "b.npy", values.astype(np.float32))
+    assert read_depth(tmp_path / "b.npy").max() == 65535  # of other numbers nothing tells it
+    assert read_depth(tmp_path / "a.png", signed=True).max() == 65535
+
+
 def test_a_line_needs_points_that_agree():
     given = np.arange(30.0)
     assert line_through(given[:9], given[:9] + 1) is None
@@ -81,6 +93,11 @@ def test_depth_of_a_video_is_in_the_units_of_its_poses(tmp_path):
     assert frames["images/frame_4"].load_sensed is None
     larger = read_scene(tmp_path, "toy", depth=str(tmp_path / "lidar"), depth_scale=2e-3).train[0]
     torch.testing.assert_close(larger.load_sensed()[0], 2 * frames[larger.name].load_sensed()[0])
+    edit(folder / FILE, {"depth_unit_scale_factor": 2e-3})
+    scaled = read_scene(tmp_path, "toy", depth=str(tmp_path / "lidar"))
+    torch.testing.assert_close(scaled.train[0].load_sensed(), larger.load_sensed())
+    assert not [line for line in scaled.protocol["assumed"] if "depth_unit" in line]
+    edit(folder / FILE, {"depth_unit_scale_factor": None})
     edit(folder / FILE, {"frames.0.depth_file_path": "../lidar/frame_1.png"})
     with refused("depth_file_path"):
         read_scene(tmp_path, "toy")

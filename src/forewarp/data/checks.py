@@ -172,7 +172,11 @@ def _of_test_images(scene: Scene) -> Iterator[str]:
         if not near < away < far:
             depth, near, far = (_length(scene, length) for length in (away, near, far))
             line = f"{deep.name}: its depth is {depth} in the median, with near at {near} and far at {far}"
-            yield f"{line}; write it in the units of the poses"
+            advice = "write it in the units of the poses"
+            if scene.protocol.get("dataset") == "video_with_poses":
+                advice += ", or set data.depth_scale (0.001 for .npy in millimetres, 0.0002 for TUM's PNG)"
+                advice += ", or data.depth_kind=inverse if it is 1 / depth"
+            yield f"{line}; {advice}"
 
 
 def _aimed(scene: Scene, aim: Tensor) -> Iterator[str]:

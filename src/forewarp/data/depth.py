@@ -36,8 +36,8 @@ class SensedDepth:
     room; it is read-only.
 
     Args:
-        path: .npy (H', W') or (H', W', 1), or grey PNG of 16 bits, of depths; what is 0 or not finite is a
-            hole. Its proportions are the image's, of which each pixel takes the nearest.
+        path: .npy (H', W'), (H', W', 1) or (1, H', W'), or grey PNG of 16 bits, of depths; what is 0 or not
+            finite is a hole. Its proportions are the image's, of which each pixel takes the nearest.
         camera: of the image.
         scale: world units for one unit of the file.
         confidence: .npy or grey PNG as large: from 0 to 1, or ARKit's levels 0, 1, 2; None: 1 everywhere.
@@ -221,15 +221,19 @@ def _stored(folder: Path, name: str) -> Path | None:
 
 def read_depth(path: Path, *, signed: bool = False) -> np.ndarray:
     """Read depths (H, W) float64 of a file as ``SensedDepth`` takes them, holes as 0; ``signed``: any values,
-    holes as NaN.
+    holes as NaN. Of whole numbers the largest of their type (65535 of a PNG) is a hole unless ``signed``.
 
     Raises:
         SceneError: for another shape, and for a depth below 0.
     """
     depth = read_gray16(path) if path.suffix == ".png" else load_numpy(path)
-    depth = depth[..., 0] if getattr(depth, "shape", ())[2:] == (1,) else depth
+    shape = getattr(depth, "shape", ())
+    depth = depth[..., 0] if shape[2:] == (1,) else depth[0] if len(shape) == 3 and shape[0] == 1 else depth
     check_shape(depth, path, "depths (H, W)", None, None)
+    is_full = depth == np.iinfo(depth.dtype).max if depth.dtype.kind in "iu" else None
     depth = np.array(depth, np.float64)
+    if is_full is not None and not signed:
+        depth[is_full] = 0
     depth[~np.isfinite(depth)] = np.nan if signed else 0
     if signed:
         return depth

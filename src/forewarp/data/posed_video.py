@@ -82,6 +82,7 @@ from forewarp.scene.frame import Frame, Scene, middle_of
 
 FILE, POINTS = "transforms.json", "points.npy"
 SCALES = (1, 2, 4, 8)
+_UNIT = "depth_unit_scale_factor"  # nerfstudio's, of all depths
 _OF_CAMERA = ("w", "h", "fl_x", "fl_y", "cx", "cy", "camera_model", "k1", "k2", "k3", "p1", "p2")
 
 
@@ -163,7 +164,8 @@ def read_scene(
         depth_kind: in the file's units along the optical ``axis`` or the pixel's ``ray``; ``relative``, but
             for a scale and a shift of each image; ``inverse``, 1 / depth likewise. Points that never move
             tell both. None: along the axis, unless views agree much better along rays, which is refused.
-        depth_scale: units of the file for one unit of a metric depth; None: a thousandth of a PNG, 1 of .npy.
+        depth_scale: units of the file for one unit of a metric depth; None: its ``depth_unit_scale_factor``,
+            or a thousandth of a PNG, 1 of .npy.
 
     Raises:
         SceneError: for every file or value that is missing or wrong, with file and key.
@@ -186,6 +188,9 @@ def read_scene(
     entries, absent, assumed = _read_entries(file, content, scale, axes, inverse, masks)
     assumed += ordered
     beside = [] if depth in (None, "off") else [file.parent / depth]
+    unit, content = content.get(_UNIT), {key: value for key, value in content.items() if key != _UNIT}
+    if depth_scale is None:
+        depth_scale = number_or_none(unit, f"{file}: {_UNIT}", 1 / MOST_UNITS)
     assumed += unread_beside(file, content, [entry.path for entry in entries], beside)
     cut_out = [entry.load for entry in entries if entry.is_cut_out]
     premultiplied, told = alpha_of(alpha, [load.path for load in cut_out], file)
