@@ -26,7 +26,7 @@ FENCE = re.compile(r"^( *)```(\w*)\n(.*?)^ *```", re.MULTILINE | re.DOTALL)
 # What a reader types into the search -> the title of the first page that it lists.
 FOUND = {"average splat": "forewarp.ops", "page of a run": "The page of a run", "the viewer": "The viewer"}
 # Of packages that tests/cli/test_foreign.py writes, of plans that must exist, and patterns of commands.
-OTHERS = ("--config-dir", "mine", "model=balls", "plan=", "specimen_<", "...")
+OTHERS = ("forewarp-data", "--config-dir", "mine", "model=balls", "plan=", "specimen_<", "...")
 
 
 def pages_in(entry) -> list[str]:

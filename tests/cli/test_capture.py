@@ -268,7 +268,7 @@ def test_a_video_becomes_a_scene_that_is_trained_also_when_interrupted(ok, in_tm
         time.sleep(0.05)
     process.send_signal(signal.SIGINT)
     said = process.communicate()[1]
-    assert process.returncode == 130
+    assert process.returncode == 130, said
     assert "interrupted; run the same command again" in said
     assert (work / "database.db").exists()
     assert not (in_tmp / "captures" / "hand").exists()

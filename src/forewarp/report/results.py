@@ -68,6 +68,7 @@ OWN = "run|sheets|paths.runs|paths.data"  # keys that say where a run's files ar
 PLACES = {"paths.scenes": "DATASETS", "data.root": "SCENES", "lpips_weights": "WEIGHTS"}
 UNREADABLE = OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError, OverflowError
 ENDS = 0.1  # share of the time that counts as its first and last part
+_LIMITS = "minutes", "iterations"  # of a budget
 _EARLY, _LATE = 0.95, 1.5  # of its minutes: less was ended by steps, more had a last step that took long
 
 
@@ -279,6 +280,13 @@ def refused(before: str = "", after: str = "") -> Iterator[None]:
         raise ValueError(f"{before}{why}{after}") from error
 
 
+def _check_numbers(file: Path, values: Iterable[tuple[str, object]]) -> None:
+    """Refuse what is neither a number nor null, naming its key."""
+    for key, value in values:
+        if value is not None and (isinstance(value, bool) or not isinstance(value, int | float)):
+            raise ValueError(f"{file}: {key}: expected a number, but got {value!r:.80}; run it again")
+
+
 @refused()
 def read_run(folder: Path) -> Row:
     """Read a run's folder; files that are missing are empty.
@@ -315,7 +323,12 @@ def read_run(folder: Path) -> Row:
     images.sort(key=lambda image: image["name"])
 
     protocol, test, flow, sizes = (metrics.get(key) or {} for key in ("protocol", "test", "flow", "size"))
+    scores = [
+        (f"test.{kind}.{name}", value) for kind, of_kind in test.items() for name, value in of_kind.items()
+    ]
+    _check_numbers(folder / "metrics.json", scores)
     budget, variant, method = config["budget"], config.get("variant") or {}, config["model"]["name"]
+    _check_numbers(folder / "config.yaml", [(f"budget.{key}", budget.get(key)) for key in _LIMITS])
     # A name may be what was typed, as the command has it, in folders of earlier versions.
     named = str(variant.get("name") or "")
     ablation = named if set(variant) - {"name"} or re.fullmatch(r"[^=~]+", named) else None
