@@ -96,7 +96,8 @@ def test_runs_of_other_steps_or_views_are_no_seeds(tmp_path, write):
             psnr=30.0 + seed,
         )
     text = write(tmp_path / "runs", tmp_path)[0].read_text()
-    names = {cell.strip() for line in text.splitlines() for cell in line.split("|") if " at most" in cell}
+    cells = {cell.strip() for line in text.splitlines() for cell in line.split("|")}
+    names = {cell for cell in cells if cell.count(" at most") == 1}  # several share a row of the cheapest
     steps = "forward-fast, threads: {}, {} steps at most"
     assert names == {steps.format(2, 100), steps.format(2, 200), steps.format(1, 200)}
 
