@@ -264,7 +264,7 @@ CONFIG = "data: {scene: a}, model: {name: b}, seed: 0"
         ("plan.yaml", "effects: {motion: {choice: x}}", "no key 'on'"),
         ("config.yaml", f"{{{CONFIG}, preset: null, budget: {{}}}}", "preset: expected keys of its own"),
         ("coarse/done.json", '{"steps": 3}', "no key 'seconds'"),
-        ("config.yaml", f"{{{CONFIG}, preset: {{name: c}}, budget: {{minutes: x}}}}", "budget.minutes: expected a number"),
+        ("config.yaml", f"{{{CONFIG}, preset: {{name: c}}, budget: {{minutes: x}}}}", "minutes: expected"),
     ],
 )
 def test_a_broken_file_ends_in_one_line(tmp_path, file, content, says):
