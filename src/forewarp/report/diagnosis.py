@@ -396,8 +396,8 @@ def more_steps(steps: float, rise: float | None) -> float:
     Up to 1,000 steps for each training image the bound, 0.5 dB and 40 dB over the steps, at most 5 dB, lies
     above nearly all of what doubling the time brought to this project's runs of eleven methods on nine scenes
     (docs/results). Beyond, where few runs are, its 0.5 dB are taken to fall as steps grow. The rise within a
-    run is no measure of it, as learning rates fall at the end of any run: twice the time brought up to 1.8
-    times the rise of the last third. Where the curve is flat it is taken to bring no more than twice that.
+    run is no measure of it, as learning rates fall at the end of any run: in one run twice the time brought
+    1.8 times the rise of the last third. It is taken to bring at most two times that rise.
 
     >>> [round(more_steps(steps, None), 3) for steps in (5, 100, 1000, 130_000)], more_steps(100, 0.1)
     ([9.5, 0.9, 0.54, 0.004], 0.2)

@@ -280,11 +280,14 @@ def refused(before: str = "", after: str = "") -> Iterator[None]:
         raise ValueError(f"{before}{why}{after}") from error
 
 
-def _check_numbers(file: Path, values: Iterable[tuple[str, object]]) -> None:
-    """Refuse what is neither a number nor null, naming its key."""
+def _check_kind(file: Path, values: Iterable[tuple[str, object]], kind: str = "number") -> None:
+    """Refuse values that are neither null nor of a kind, ``number`` or ``text``, naming the key."""
+    types = {"number": (int, float), "text": (str,)}[kind]
     for key, value in values:
-        if value is not None and (isinstance(value, bool) or not isinstance(value, int | float)):
-            raise ValueError(f"{file}: {key}: expected a number, but got {value!r:.80}; run it again")
+        if value is not None and (isinstance(value, bool) or not isinstance(value, types)):
+            raise ValueError(
+                f"{file}: {key}: expected a {kind}, but got {value!r:.80}; measure the run again"
+            )
 
 
 @refused()
@@ -326,9 +329,9 @@ def read_run(folder: Path) -> Row:
     scores = [
         (f"test.{kind}.{name}", value) for kind, of_kind in test.items() for name, value in of_kind.items()
     ]
-    _check_numbers(folder / "metrics.json", scores)
+    _check_kind(folder / "metrics.json", scores)
     budget, variant, method = config["budget"], config.get("variant") or {}, config["model"]["name"]
-    _check_numbers(folder / "config.yaml", [(f"budget.{key}", budget.get(key)) for key in _LIMITS])
+    _check_kind(folder / "config.yaml", [(f"budget.{key}", budget.get(key)) for key in _LIMITS])
     # A name may be what was typed, as the command has it, in folders of earlier versions.
     named = str(variant.get("name") or "")
     ablation = named if set(variant) - {"name"} or re.fullmatch(r"[^=~]+", named) else None
@@ -348,14 +351,10 @@ def read_run(folder: Path) -> Row:
     row |= {"minutes": budget["minutes"], "iterations": budget.get("iterations")}
     row |= {"clock": protocol.get("clock") or budget.get("clock") or "wall"}
     copied = ("threads", "device", "commit", "departures", "faults", "train_views")
-    row |= {name: protocol.get(name) for name in copied} | {
-        "torch": protocol.get("versions", {}).get("torch")
-    }
-    kinds = {str: "text", int | float: "number"}
-    for name, kind in {"device": str, "torch": str, "commit": str, "threads": int | float}.items():
-        if not isinstance(row[name], kind | None):
-            got = f"{row[name]!r:.80}; measure the run again"
-            raise ValueError(f"{folder / 'metrics.json'}: {name}: expected a {kinds[kind]}, but got {got}")
+    row |= {name: protocol.get(name) for name in copied}
+    row |= {"torch": protocol.get("versions", {}).get("torch")}
+    _check_kind(folder / "metrics.json", [(key, row[key]) for key in ("device", "torch", "commit")], "text")
+    _check_kind(folder / "metrics.json", [("threads", row["threads"])])
     row |= {"held_out": protocol.get("held_out") or None}
     row |= {"measured": protocol.get("measured", f"all {frames} test views" if frames else None)}
     row |= {"tested": int(tested) if tested.isdigit() else None}  # as of "10 of 30 test views, evenly spread"
