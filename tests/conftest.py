@@ -2,7 +2,6 @@
 
 # ruff: noqa: E402 (torch is imported after it is said how its threads wait)
 import gc
-import resource
 
 from forewarp.cli.entry import wait_briefly
 
@@ -44,14 +43,6 @@ def _times_of_tests(tmp_path_factory):
         patch.setenv("FOREWARP_TIMES", str(own / "times.csv"))
         patch.setattr("forewarp.files.own_folder", lambda: own)
         yield
-
-
-@pytest.fixture
-def room():
-    """``room(size)`` is the most bytes that a file may have from then on, as on a disk that is full."""
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    yield lambda size: resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
-    resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
 @pytest.fixture

@@ -9,6 +9,7 @@ from forewarp.drawing import images
 from forewarp.drawing.images import write_png, write_video
 from forewarp.files import disk_error
 from tests.support.films import read_film
+from tests.support.full_disk import file_size_limit
 
 RED = torch.tensor([[1.0, 0.0, 0.0]])
 
@@ -135,12 +136,11 @@ def test_nothing_half_written_stays(tmp_path, suffix):
 
 
 @pytest.mark.parametrize("name", ["a.mp4", "a.gif", "a.png"])
-def test_a_full_disk_is_an_error_and_keeps_the_film_that_was_there(tmp_path, room, name):
+def test_a_full_disk_is_an_error_and_keeps_the_film_that_was_there(tmp_path, name):
     noise = [torch.rand(64, 64, 3, generator=torch.Generator().manual_seed(0)) for _ in range(4)]
     (tmp_path / name).write_text("good")
     write = write_png if name == "a.png" else write_video
-    room(4096)
-    with pytest.raises(OSError, match="ended early|too large") as refused:
+    with file_size_limit(4096), pytest.raises(OSError, match="ended early|too large") as refused:
         write(tmp_path / name, noise[0]) if name == "a.png" else write(tmp_path / name, noise, fps=5)
     assert refused.value.filename == str(tmp_path / name)
     assert [path.read_text() for path in tmp_path.iterdir()] == ["good"]

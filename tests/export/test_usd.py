@@ -8,6 +8,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from tests.export.conftest import TIMES, exporter
+from tests.support.full_disk import file_size_limit
 from tests.support.particles import module_with, shaken, small_data
 from tests.support.tiny_scene import camera_at
 
@@ -105,11 +106,10 @@ def test_other_axes_and_methods_are_refused(particles, ball, tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_full_disk_is_an_error_and_keeps_the_file_that_was_there(particles, tmp_path, room):
+def test_a_full_disk_is_an_error_and_keeps_the_file_that_was_there(particles, tmp_path):
     export(particles, tmp_path / "out")
     before = (tmp_path / "out" / "scene.usdc").read_bytes()
-    room(2000)
-    with pytest.raises(OSError, match=r"too large|No space") as refused:
+    with file_size_limit(2000), pytest.raises(OSError, match=r"too large|No space") as refused:
         export(particles, tmp_path / "out")
     assert refused.value.filename == str(tmp_path / "out" / "scene.usdc")
     assert (tmp_path / "out" / "scene.usdc").read_bytes() == before

@@ -2,7 +2,6 @@
 
 import json
 import math
-import resource
 import zipfile
 from dataclasses import replace
 from functools import partial
@@ -17,6 +16,7 @@ from forewarp.scene.box import Box
 from forewarp.scene.cloud import Cloud, Handover
 from forewarp.training import checkpoints
 from tests.support import tiny_scene as tiny
+from tests.support.full_disk import file_size_limit
 
 
 def run(folder, callbacks=(), width=8, times=None):
@@ -144,13 +144,8 @@ CONTENT = {"a": torch.arange(1000.0), "b": {"c": [1, "x", None]}}
 def test_a_full_disk_is_told_and_leaves_what_was_there(tmp_path):
     path = tmp_path / "a.pt"
     checkpoints.write_archive(path, {"a": 1})
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (2048, before[1]))
-    try:
-        with pytest.raises(OSError, match="File too large") as refusal:
-            checkpoints.write_archive(path, CONTENT)
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    with file_size_limit(2048), pytest.raises(OSError, match="File too large") as refusal:
+        checkpoints.write_archive(path, CONTENT)
     assert refusal.value.filename == str(path)
     assert checkpoints.read_archive(path) == {"a": 1}
     assert [path.name for path in tmp_path.iterdir()] == ["a.pt"]
