@@ -48,7 +48,11 @@ def test_a_gif_of_small_images_is_larger_and_large_images_keep_their_size(ok, ru
 @pytest.mark.parametrize(
     ("word", "says"),
     [
-        ("path=spiral", "path: expected fixed, swing, orbit, both or trajectories, but got 'spiral'"),
+        (
+            "path=spiral",
+            "path: expected as_filmed, stabilised, lean, fixed, swing, orbit, both or trajectories, but",
+        ),
+        ("path=lean", "path: expected fixed, swing, orbit, both or trajectories, as no one camera filmed"),
         ("fps=0", "fps: expected a number in [0.1, 1000], but got 0"),
         ("format=avi", "format: expected mp4, gif or png, but got 'avi'"),
         ("layer=still", "layer: expected all, moving or resting, but got 'still'"),

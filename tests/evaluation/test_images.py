@@ -1,3 +1,5 @@
+import math
+
 import pytest
 import torch
 
@@ -12,6 +14,7 @@ from forewarp.evaluation.images import (
     within,
 )
 from forewarp.evaluation.trajectories import Trajectories, moving_points
+from forewarp.scene.film import FilmPath
 from forewarp.scene.view import Target
 from tests.support.tiny_scene import RADIUS, TRAVEL, ball_center, ball_data, ball_scene, camera_at, known_ball
 
@@ -157,3 +160,61 @@ def test_a_still_scene_is_left_as_it_is(cameras):
     assert len(paint.points) == 0
     picture = torch.rand(4, 4, 3, generator=torch.Generator().manual_seed(0))
     assert paint(picture, None, cameras[0], 0.5) is picture
+
+
+FILMED = [camera_at(0.06 * number) for number in range(7)]
+
+
+@pytest.fixture(scope="module")
+def film():
+    return FilmPath.of(FILMED, [i / 6 for i in range(7)], 6.0)
+
+
+def degrees_beside(film, shots):
+    """Angles between each shot's camera and the film's at its time, seen from what the latter looks at."""
+    angles = []
+    for camera, time in shots:
+        filmed = film.at(time)
+        pivot = film.pivot(filmed)
+        towards = (torch.nn.functional.normalize(c.center - pivot, dim=0) for c in (camera, filmed))
+        angles.append(math.degrees(math.acos(min(1.0, float(torch.dot(*towards))))))
+    return angles
+
+
+def test_a_film_is_shown_as_it_was_filmed(film):
+    shots = make_shots("as_filmed", 7, 0.5, FILMED[0].resized(48, 48), FILMED, film)
+    assert [time for _, time in shots] == pytest.approx(film.times)
+    for (camera, _), filmed in zip(shots, FILMED):
+        torch.testing.assert_close(camera.camera_to_world, filmed.camera_to_world, atol=1e-6, rtol=0)
+        assert (camera.width, camera.fx) == (48, 2 * filmed.fx)
+
+
+@pytest.mark.parametrize("path", ["stabilised", "lean", "fixed", "swing", "trajectories"])
+def test_no_path_through_a_film_leaves_the_angle_that_is_trusted(film, path):
+    shots = make_shots(path, 25, 0.5, FILMED[0], FILMED, film, seconds=6.0)
+    beside = degrees_beside(film, shots)
+    assert max(beside) < 6.001
+    if path in ("lean", "fixed", "swing"):
+        assert max(beside) > 5.5
+    for camera, _ in shots:
+        assert float(camera.camera_to_world[:3, :3].det()) == pytest.approx(1)
+
+
+def test_a_stabilised_path_turns_less_suddenly_and_shows_only_what_was_filmed():
+    shaken = [camera_at(0.01 * number) for number in range(40)]
+    for number, camera in enumerate(shaken):
+        camera.camera_to_world[2, 3] += 0.06 * (-1) ** number
+    film = FilmPath.of(shaken, [i / 39 for i in range(40)])
+    ways = {}
+    for path in ("as_filmed", "stabilised"):
+        shots = make_shots(path, 40, 0.5, FILMED[0], shaken, film)
+        heights = torch.stack([camera.center[2] for camera, _ in shots])
+        ways[path] = float(heights.diff().diff().abs().mean())
+    assert ways["stabilised"] < 0.5 * ways["as_filmed"]
+    assert all(camera.fx > FILMED[0].fx for camera, _ in shots)
+
+
+def test_paths_of_a_film_are_refused_without_one(cameras):
+    assert FilmPath.of(cameras, [i / 11 for i in (0, 5, 2, 9, 1, 11, 3, 7, 4, 8, 6, 10)]) is None
+    with pytest.raises(ValueError, match="path: expected fixed, .* no one camera filmed .* got 'lean'"):
+        make_shots("lean", 5, 0.5, cameras[0], cameras)

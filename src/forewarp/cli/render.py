@@ -2,15 +2,19 @@
 forewarp-render makes a video of a finished run, into its videos/.
 
   forewarp-render run=runs/vehicle/particles-demo-seed0 path=both
-  forewarp-render run=runs/hand/particles-fast-seed0 path=swing      a capture, filmed from one side
+  forewarp-render run=runs/hand/particles-fast-seed0 path=lean       a film by one camera
   forewarp-render run=FOLDER path=trajectories format=gif size=300
 
 Of a film, what no training image shows, or only from other sides, fades to black; how much did is said.
 
 What one types most:
   run=FOLDER                    the run (needed)
-  path=fixed                    one camera, through time; what you get without path=
-  path=swing                    to and fro while time passes, as far as the training cameras stand
+  path=as_filmed                the camera's own way, at its own speed; what you get of a film without path=
+  path=stabilised               the same, smoothed
+  path=lean                     a slow figure of eight about it, within the angle that is trusted
+  path=fixed                    one camera, through time; what you get of other scenes without path=
+  path=swing                    to and fro while time passes, as far as the training cameras stand. Of a
+                                film fixed and swing, too, stay within the angle that is trusted
   path=orbit time=0.5           once around, at one time
   path=both                     once around while time passes
   path=trajectories             as fixed, with the trajectories of points on the moving surface drawn over it
@@ -32,6 +36,7 @@ from pathlib import Path
 from forewarp.cli.entry import command
 
 HALF = 0.5  # share of a pixel, above which it counts as what fills it
+_FRAMES, _MOST_FRAMES = 60, 1200  # of a video whose length nothing tells, and at most without frames=
 LEAST_SIZE = 400  # pixels of the longer side, unless size= asks for another
 
 
@@ -46,31 +51,36 @@ def render(config) -> None:
 
     if config.path in ("orbit", "both") and saved.get("capture") != "cut_out":
         around = f"path={config.path} goes all around, also to where no camera of a capture from one side has"
-        print(f"{around} looked; path=swing stays between the training cameras")
+        print(f"{around} looked; path=lean stays within the angle that is trusted")
     file = write_film(config, *opened(saved))
     print(f"written: {file}" + (f" and {file.with_suffix('')}_masks" if config.masks == "true" else ""))
 
 
 def write_film(config, run, module) -> Path:
-    """Write the video that the config describes, and its masks, into the run's folder; return its file."""
+    """Write the video that the config describes, and its masks, into the run's folder; return its file.
+    Without a ``path`` the config gets the one that suits the scene.
+    """
     from forewarp.drawing.images import write_video
     from forewarp.progress import Counted
+    from forewarp.runs.fitted import film_of
 
+    film = film_of(run)
+    config.path = config.path or ("fixed" if film is None else "as_filmed")
     name = config.path if config.layer == "all" else f"{config.path}_{config.layer}"
     folder = Path(run.folder) / "videos"
     with Counted(config.path) as progress:
-        pictures = pictures_of(config, module, run.datamodule, folder / f"{name}_masks", progress)
+        pictures = pictures_of(config, module, run.datamodule, film, folder / f"{name}_masks", progress)
         return write_video(folder / f"{name}.{config.format}", pictures, fps=float(config.fps))
 
 
-def pictures_of(config, module, datamodule, masks: Path, progress):
+def pictures_of(config, module, datamodule, film, masks: Path, progress):
     """Render the pictures of the video that the config describes, and report each to ``progress``.
 
     If it asks for them, write for each which of its pixels are mostly what moves, ``masks/0000.png`` ...
     """
     from forewarp.drawing.images import keep_first, write_png
     from forewarp.evaluation.filmed import Fade
-    from forewarp.evaluation.images import make_shots, moving_share, sized, video
+    from forewarp.evaluation.images import FILMED, make_shots, moving_share, sized, video
     from forewarp.evaluation.layers import layer_of, moving_rows
     from forewarp.evaluation.trajectories import Trajectories
 
@@ -87,9 +97,12 @@ def pictures_of(config, module, datamodule, masks: Path, progress):
     target = targets[config.view]
     camera, background = target.frame.camera, target.background.to(module.device)
     start = sized(camera, config.size or max(camera.width, camera.height, LEAST_SIZE))
-    shots = make_shots(config.path, config.frames, float(config.time), start, cameras)
+    seconds = datamodule.scene.protocol.get("seconds")
+    lasts = round(seconds * config.fps) if seconds and config.path in FILMED else _FRAMES
+    count = config.frames or min(max(lasts, 2), _MOST_FRAMES)
+    shots = make_shots(config.path, count, float(config.time), start, cameras, film, seconds)
 
-    def film():
+    def pictures():
         if moving is not None:
             keep_first(masks, len(shots))
         for number, picture in enumerate(video(module, shots, background, paints)):
@@ -101,7 +114,7 @@ def pictures_of(config, module, datamodule, masks: Path, progress):
         if fade is not None and (line := fade.told()):
             print(line)
 
-    return film()
+    return pictures()
 
 
 def check(config) -> None:
@@ -113,7 +126,8 @@ def check(config) -> None:
     from forewarp.evaluation.layers import LAYERS
 
     for key, known in (("path", PATHS), ("format", FORMATS), ("layer", LAYERS)):
-        one_of(config[key], key, *known)
+        if config[key] is not None or key != "path":
+            one_of(config[key], key, *known)
     config.masks = str(config.masks).lower()  # typed, it is text, as the folder of forewarp-capture is
     one_of(config.masks, "masks", "true", "false")
     refuse_numbers(config, *LEAST, *RANGES)

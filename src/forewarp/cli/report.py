@@ -32,7 +32,7 @@ What one types most:
   run=FOLDER             run: the run; its page is <run>/page.html, or out=FILE.html
   megabytes=N            run: most of the page; pictures and the video are made smaller to fit
   render=false           run: show only what the folder has; load no method and no data; for slow methods
-  path=both|trajectories|swing|fixed|orbit   run: which video, as in forewarp-render
+  path=as_filmed|lean|both|fixed|...   run: which video, as in forewarp-render
   data.root=FOLDER       run: where the data are now, if they moved
   trainer=cpu|gpu|auto   run: device to compute with; without it the one of the run
   trust=[PACKAGE]        run: code of other packages that a run's config may name
@@ -227,8 +227,9 @@ def _render(config: DictConfig, row: dict, media) -> None:
         media.missing = ["No video: the scene has no test view to begin it from."]
         return
     film = OmegaConf.load(project_root() / "conf" / "render.yaml")
-    film.path = config.path or ("both" if row["config"].get("capture") == "cut_out" else "swing")
-    media.video, media.about = write_film(film, run, module), FILMS[film.path]
+    film.path = config.path or ("both" if row["config"].get("capture") == "cut_out" else None)
+    media.video = write_film(film, run, module)
+    media.about = FILMS[film.path]
 
 
 def _diagnose(row: dict, media, run, module) -> None:

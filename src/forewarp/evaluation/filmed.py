@@ -69,5 +69,5 @@ class Fade:
         if not gone:
             return None
         many, most = f"{len(gone)} of {len(self.shares)} images", f"up to {max(gone):.0%} of one"
-        faded = "it fades to black (path=swing stays where it was filmed)"
+        faded = "it fades to black (path=as_filmed stays where it was filmed)"
         return f"{many} show what no training image shows, {most}: {faded}"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
@@ -21,11 +22,14 @@ from forewarp.drawing.images import (
 from forewarp.methods.method import HasTrajectories, Method, Snapshot
 from forewarp.ops.backend import is_number
 from forewarp.scene.camera import Camera, focus_point, mean_up, orbit, swing
+from forewarp.scene.film import FilmPath
 from forewarp.scene.frame import Frame, spread
 from forewarp.scene.view import Moment, Rendering, Target, View
 from forewarp.training.module import DynamicSceneModule
 
-PATHS = ("fixed", "swing", "orbit", "both", "trajectories")  # of videos
+FILMED = ("as_filmed", "stabilised", "lean")  # paths of videos that follow the camera of a film
+PATHS = (*FILMED, "fixed", "swing", "orbit", "both", "trajectories")
+_LOOP = 6.0  # seconds of a lean's figure of eight, in the films' length
 _SEEN = 0.02  # show the motion of pixels at least this opaque
 
 Shot = tuple[Camera, float]  # camera and time
@@ -120,24 +124,55 @@ def validation_psnr(module: DynamicSceneModule, targets: Sequence[Target], rays:
     return sum(values) / len(values)
 
 
-def make_shots(path: str, frames: int, time: float, camera: Camera, cameras: Sequence[Camera]) -> list[Shot]:
+def make_shots(
+    path: str,
+    frames: int,
+    time: float,
+    camera: Camera,
+    cameras: Sequence[Camera],
+    film: FilmPath | None = None,
+    seconds: float | None = None,
+) -> list[Shot]:
     """Return camera and time of each frame of a video.
 
     Args:
-        path: one of ``PATHS``. ``fixed`` and ``trajectories`` go through time, ``orbit`` once around at
-            ``time``, ``both`` once around while time passes, ``swing`` to and fro meanwhile, as far as the
-            training cameras stand.
+        path: one of ``PATHS``. ``as_filmed`` goes where the film's camera went, ``stabilised`` smoothly,
+            ``lean`` in a figure of eight about it, within the angle that is trusted. ``fixed`` and
+            ``trajectories`` go through time, ``orbit`` once around at ``time``, ``both`` once around while
+            time passes, ``swing`` to and fro meanwhile, as far as the training cameras stand; of a film
+            ``fixed``, ``trajectories`` and ``swing`` stay within the angle that is trusted.
         frames: number of frames.
         time: the time of ``orbit``, in [0, 1].
-        camera: camera of the first frame.
+        camera: camera of the first frame, and its size that of all.
         cameras: the training cameras, from which focus and up direction are computed.
+        film: the path of the film's camera, if one took all images.
+        seconds: how long the film lasts, if that is known.
+
+    Raises:
+        ValueError: for one of ``FILMED`` without ``film``.
     """
     views, times = [camera] * frames, torch.linspace(0, 1, frames).tolist()
+    if path in FILMED:
+        if film is None:
+            expected = f"path: expected {', '.join(PATHS[len(FILMED) : -1])} or {PATHS[-1]}"
+            raise ValueError(f"{expected}, as no one camera filmed all of this scene, but got {path!r}")
+        views = [film.at(t) if path == "as_filmed" else film.stabilised(t) for t in times]
+        if path == "lean":
+            loops = max(1, round((seconds or _LOOP) / _LOOP))
+            angles = [2 * math.pi * loops * t for t in times]
+            eight = [(film.degrees * math.sin(a), 0.5 * film.degrees * math.sin(2 * a)) for a in angles]
+            leaning = [film.lean(view, *degrees) for view, degrees in zip(views, eight)]
+            views = [film.within(view, t) for view, t in zip(leaning, times)]
+        if path != "as_filmed":
+            views = film.zoomed(views, times)
+        return [(view.resized(camera.width, camera.height), t) for view, t in zip(views, times)]
     if path in ("orbit", "both", "swing"):
         # Leave out the full turn, which repeats the first frame, so that the video loops smoothly.
         turns, cameras = torch.arange(frames, dtype=torch.float64) / frames, list(cameras)
         about = focus_point(cameras), mean_up(cameras)
         views = swing(camera, cameras, *about, turns) if path == "swing" else orbit(camera, *about, turns)
+    if film is not None and path in ("fixed", "swing", "trajectories"):
+        views = [film.within(view, t) for view, t in zip(views, times)]
     return list(zip(views, [time] * frames if path == "orbit" else times))
 
 

@@ -32,6 +32,9 @@ WHYS = "best", "median", "worst"  # views to look at, as they are shown
 PARTS = "truth", "prediction", "error"  # of a sheet
 # Videos in the order in which one of a folder is taken.
 FILMS = {
+    "lean": "a slow figure of eight about where the camera was, within the angle that is trusted",
+    "stabilised": "where the camera was, smoothed",
+    "as_filmed": "as it was filmed",
     "both": "once around the scene while its time passes",
     "trajectories": "one camera, with the paths of points on the moving surface",
     "swing": "to and fro between the training cameras while the scene's time passes",

@@ -37,6 +37,7 @@ from forewarp.runs.overrides import key_of, typed_overrides
 from forewarp.runs.session import warn_if_changed
 from forewarp.scene.camera import Camera, Vector, focus_point, mean_up, tensor_of
 from forewarp.scene.cloud import Cloud
+from forewarp.scene.film import FilmPath
 from forewarp.scene.frame import Frame, Scene, spread
 from forewarp.scene.view import Moment, Rendering, View
 from forewarp.scene.world import World
@@ -265,6 +266,17 @@ def opened(config: DictConfig, device: str | torch.device | None = None) -> tupl
     module = run.load().to(device or run.device)
     warn_if_changed(run)
     return run, module.eval()
+
+
+def film_of(run: Run) -> FilmPath | None:
+    """Return the path of the one camera that filmed a run's scene; None where there was none."""
+    return FilmPath.of_scene(run.datamodule.scene, trust_degrees(Path(run.folder)))
+
+
+def trust_degrees(folder: Path) -> float | None:
+    """Return the angle beside its film's path to which a run was found to be good; None: not measured."""
+    metrics = read_json(folder / "metrics.json") or {}
+    return metrics.get("trust_degrees")
 
 
 def open_run(
