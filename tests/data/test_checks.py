@@ -183,11 +183,6 @@ def filmed_by(change):
     return replace(SCENE, train=[replace(f, camera=change(f.camera)) for f in SCENE.train])
 
 
-def with_depth(value):
-    depth = torch.full((16, 16), value)
-    return replace(SCENE, test=(replace(SCENE.test[0], load_depth=lambda: depth), *SCENE.test[1:]))
-
-
 @pytest.mark.parametrize(
     ("size", "focal", "is_told"),
     [((128, 96), 24, True), ((1920, 1080), 24, True), ((128, 96), 40, True), ((128, 96), 46.5, False)],
@@ -204,7 +199,6 @@ def test_focal_lengths_in_millimetres_are_told(size, focal, is_told):
     [
         (far_off(1000), r"3 of 3 test images see nothing of the box .*in other units"),
         (of_test(fx=60.0, fy=60.0), r"focal length of test images is 3.8 of .* training images 1.2 to 1.2"),
-        (with_depth(3000.0), "depth is 3000 in the median, with near at 1 and far at 5.5; write it in the"),
         (
             filmed_by(lambda camera: replace(camera, fx=2.0, fy=2.0)),
             "images are 152 degrees wide, as if .* not in pixels; if fl_x is in millim.* by w",
@@ -215,7 +209,6 @@ def test_focal_lengths_in_millimetres_are_told(size, focal, is_told):
 )
 def test_test_images_and_focal_lengths_of_other_units_are_told(scene, said):
     assert re.search(said, next(remarks(scene)))
-    assert list(remarks(with_depth(3.0))) == []
 
 
 def test_images_without_a_subject_are_refused_and_few_of_them_told():
@@ -468,3 +461,23 @@ def test_a_middle_of_other_images_is_named(size, middle, advice):
 @pytest.mark.parametrize("middle", [(32, 24), (20, 24), (40, 30), (0, 0), (31, 27), (25, 18)])
 def test_a_middle_that_is_shifted_is_taken(middle):
     check_camera(Camera(64, 48, 50.0, 50.0, *middle, torch.eye(4).double(), 0.1, 1.0), "cx", "k1")
+
+
+def with_motion(mask, still=None, key="load_moving"):
+    train = tuple(replace(f, **{key: lambda: mask}) for f in SCENE.train)
+    return "; ".join(remarks(replace(SCENE, train=train, still=still)))
+
+
+def test_masks_the_other_way_round_are_told_by_points_or_their_place():
+    middle = torch.zeros(16, 16, dtype=torch.bool)
+    middle[5:11, 5:11] = True
+    still = 0.02 * torch.randn(200, 3, generator=torch.Generator().manual_seed(0))
+    assert "100% of the points that never move lie in what moving_path says move, 14%" in with_motion(
+        middle, still
+    )
+    assert "moving_path" not in with_motion(~middle[:, :9].repeat(1, 2)[:, :16] & middle)
+    assert "moving_path" not in with_motion(middle)
+    assert "moving_path says move 86% of the pixels, as if masks were dark where" in with_motion(~middle)
+    assert "says move nothing in all 8 images looked at" in with_motion(middle & ~middle)
+    assert "lie in what masks hide, 14% of images" in with_motion(~middle, still, "load_valid")
+    assert "hide" not in with_motion(~middle, key="load_valid")

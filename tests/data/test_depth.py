@@ -1,13 +1,23 @@
 """Depth that other programs give: of any size, metric or but for a scale and a shift."""
 
+import re
+
 import numpy as np
 import pytest
 import torch
 from PIL import Image
 
-from forewarp.data.depth import SensedDepth, confidence_of, depths_beside, line_through, read_depth
+from forewarp.data.depth import (
+    SensedDepth,
+    confidence_of,
+    depths_beside,
+    doubt_depths,
+    line_through,
+    read_depth,
+)
 from forewarp.data.posed_video import FILE, read_scene
 from forewarp.scene.camera import Camera
+from forewarp.scene.frame import Frame
 from tests.support.written_scenes import edit, refused, write_video
 
 
@@ -57,8 +67,82 @@ def test_the_largest_number_of_a_png_is_a_hole_and_one_channel_may_come_first(tm
     for name in ("a.png", "a.npy"):
         assert np.array_equal(read_depth(tmp_path / name), np.where(values == 2000, 2000.0, 0.0))
     np.save(tmp_path / "b.npy", values.astype(np.float32))
-    assert read_depth(tmp_path / "b.npy").max() == 65535  # of other numbers nothing tells it
+    assert read_depth(tmp_path / "b.npy").max() == 65535  # of other numbers far tells it
     assert read_depth(tmp_path / "a.png", signed=True).max() == 65535
+
+
+def told_of(folder, depth, **options):
+    """The folder's scene, with one depth for all images, and what is said of depths."""
+    (folder / "lidar").mkdir(exist_ok=True)
+    for i in range(1, 11):
+        if depth.dtype == np.uint16:
+            Image.fromarray(depth).save(folder / "lidar" / f"frame_{i}.png")
+        else:
+            np.save(folder / "lidar" / f"frame_{i}.npy", depth)
+    scene = read_scene(folder.parent, folder.name, depth="lidar", **options)
+    return scene, [line for line in scene.protocol["assumed"] if "depth" in line.partition(": ")[2]]
+
+
+@pytest.mark.parametrize(
+    ("none", "why"),
+    [
+        (1000.0, "1000, beyond far, 120: taken for holes; set data.far if they are right"),
+        (131.07, "131.07, beyond far, 120"),
+        (1e10, "1e+10, beyond far, 120"),
+        (np.finfo(np.float32).max, "3.40282e+38, the largest of their type"),
+        (65504, "65504, beyond far, 120"),
+    ],
+)
+def test_a_number_for_no_depth_is_a_hole_and_said(tmp_path, none, why):
+    folder = write_video(tmp_path / "toy")
+    depth = np.full((20, 30), 40.0, np.float32) + np.arange(30, dtype=np.float32) / 30
+    depth[:15, :20] = none  # half of them
+    scene, lines = told_of(folder, depth)
+    assert re.search(f"50.00% of the depths looked at are {re.escape(why)}", "".join(lines))
+    assert len(lines) == 1
+    for frame in scene.train:
+        distance, trust = frame.load_sensed()
+        assert not distance[:15, :20].any()
+        assert not trust[:15, :20].any()
+        assert distance[15:].all()
+    assert told_of(folder, np.where(depth > 100, 0, depth))[1] == []
+
+
+def test_few_depths_far_beyond_far_are_holes_and_those_just_beyond_it_are_kept(tmp_path):
+    folder = write_video(tmp_path / "toy")
+    depth = np.linspace(40, 150, 600, dtype=np.float32).reshape(20, 30)
+    depth[0, 0] = 1300.0
+    (frame, *_), (line,) = told_of(folder, depth)[0].train, told_of(folder, depth)[1]
+    assert "0.17% of the depths looked at are 1300, beyond far" in line
+    assert (frame.load_sensed()[0] == 0).sum() == 1
+
+
+def test_full_numbers_of_a_png_are_said_and_the_unit_that_fits_is_named(tmp_path):
+    folder = write_video(tmp_path / "toy")
+    depth = np.full((20, 30), 40_000, np.uint16)
+    depth[:2] = 65535
+    assert "10.00% of the depths looked at are 65535, the largest of their" in told_of(folder, depth)[1][0]
+    scene, lines = told_of(folder, depth, depth_scale=1.0)
+    assert lines[1].endswith(
+        "depth is 4e+04 in the median, with near at 20 and far at 120; set data.depth_scale=0.001"
+    )
+    (folder / "lidar" / "frame_1.png").unlink()
+    for value, unit in ((40_000.0, "0.001"), (20.5 * 256, "0.01 or 0.003906"), (0.7, "100")):
+        lines = told_of(folder, np.full((20, 30), value))[1]
+        assert [line.rpartition("=")[2] for line in lines] == [unit]
+    assert "set data.depth_scale=4e+06 to" in told_of(folder, np.full((20, 30), 5e-6))[1][0]
+
+
+def test_points_that_never_move_tell_the_unit_of_depth(tmp_path):
+    camera = camera_of()
+    depth, points = wall(camera)
+    load = SensedDepth(tmp_path / "a.npy", camera, known=points)
+    frame = Frame("a", 0.0, camera, None, load_sensed=load)
+    np.save(tmp_path / "a.npy", depth * 37.0)
+    (line,) = doubt_depths([frame], 1.0, None, "toy", "set data.depth_scale={}")
+    assert "set data.depth_scale=0.02703, or data.depth_kind=inverse" in line
+    np.save(tmp_path / "a.npy", depth)
+    assert doubt_depths([frame], 1.0, None, "toy", "") == []
 
 
 def test_a_line_needs_points_that_agree():
@@ -123,10 +207,13 @@ def test_confidences_lie_as_depths_do_and_a_depth_is_of_one_image(tmp_path):
         for camera in ("cam0", "cam1"):
             (tmp_path / kind / camera).mkdir(parents=True)
             np.save(tmp_path / kind / camera / "1.npy", np.ones((2, 3)))
+    np.save(tmp_path / "confidence/cam1/1.npy", np.full((1, 2, 3), 0.5))  # one channel may come first
     names = ["images/cam0/1", "images/cam1/1"]
     found = depths_beside(tmp_path / "depth", names)
     places = [confidence_of(found[name], tmp_path / "depth") for name in names]
     assert places == [tmp_path / "confidence" / camera / "1.npy" for camera in ("cam0", "cam1")]
+    depth = tmp_path / "depth/cam1/1.npy"
+    assert (SensedDepth(depth, camera_of(3, 2), confidence=places[1])()[1] == 0.5).all()
     np.save(tmp_path / "1.npy", np.ones((2, 3)))
     with refused("1.npy: expected a depth for each image, but got one for images/c"):
         depths_beside(tmp_path, names)

@@ -1,6 +1,7 @@
 """D-NeRF and Lego Complete scenes: what is written is read and real scenes are understood."""
 
 import json
+import math
 
 import imageio.v3 as iio
 import numpy as np
@@ -8,12 +9,14 @@ import pytest
 import torch
 
 from forewarp.data import dnerf
-from forewarp.data.dnerf import read_lego_complete, read_scene
+from forewarp.data.dnerf import Shot, read_lego_complete, read_scene
 from forewarp.data.images import write_image
+from forewarp.scene.camera import look_at
 from tests.support.written_scenes import (
     ANGLE,
     FEW,
     LEGO_TRUTH,
+    UP,
     dnerf_shots,
     edit,
     lego_views,
@@ -177,3 +180,54 @@ def test_an_ability_may_have_its_file_in_its_folder(tmp_path):
     assert scene.protocol["test_views"] == FEW
     assert scene.test[0].name == "test_space/r_0"
     assert scene.test[0].load_depth().shape == (6, 8)
+
+
+def ball_shots(kind, none=0.0, unit=1.0, radius=1.0):
+    """A ball from places near each other, its depth along the ray or the axis."""
+    pixel = (torch.arange(64) + 0.5 - 32) / (32 / math.tan(0.5 * ANGLE))
+    along = torch.stack([*torch.meshgrid(pixel, pixel, indexing="xy"), torch.ones(64, 64)], -1).double()
+    rays = along / along.norm(dim=-1, keepdim=True)
+    for i in range(10):
+        center = 4.0311 * torch.tensor([math.cos(0.2 * i), math.sin(0.2 * i), 0.0], dtype=torch.float64)
+        pose = look_at(center, torch.zeros(3, dtype=torch.float64), UP).double()
+        b = (rays @ pose[:3, :3].T) @ center
+        depth = -b - (b * b - center @ center + radius**2).clamp(min=0).sqrt()
+        depth = depth if kind == "ray" else depth * rays[..., 2]
+        depth = torch.where(b * b > center @ center - radius**2, depth * unit, none)
+        rgba = torch.full((64, 64, 4), 100 + i, dtype=torch.uint8)
+        yield Shot(f"r_{i}", i / 9, pose, rgba, depth.float())
+
+
+@pytest.mark.parametrize(("kind", "other"), [("ray", "axis"), ("axis", "ray")])
+def test_which_kind_exact_depth_is_follows_from_near_views(tmp_path, kind, other):
+    exact = [shot.depth for shot in ball_shots("ray", radius=1.8)]
+    write_dnerf(tmp_path / "toy", (64, 64), test=ball_shots(kind, radius=1.8))
+    scene = read_scene(tmp_path, "toy", depth_kind=kind)
+    assert not [line for line in scene.protocol.get("assumed", []) if "depth" in line]
+    for frame, depth in zip(scene.test, exact):
+        torch.testing.assert_close(frame.load_depth(), depth, rtol=1e-5, atol=1e-6)
+    (line,) = read_scene(tmp_path, "toy", depth_kind=other).protocol["assumed"]
+    assert line.endswith(f"unless data.depth_kind={other} is right, set data.depth_kind={kind}")
+    if kind == "axis":
+        with refused("expected depths along the pixels' rays, but got .* set data.depth_kind=axis, or"):
+            read_scene(tmp_path, "toy")
+    else:
+        (line,) = read_scene(tmp_path, "toy").protocol["assumed"]
+        assert "taken for depth along the pixels' rays; if it is along the optical axis, set" in line
+
+
+@pytest.mark.parametrize("none", [1e10, 65504.0, 1000.0])
+def test_a_renderers_number_for_no_depth_is_background_and_said(tmp_path, none):
+    write_dnerf(tmp_path / "toy", (64, 64), test=ball_shots("ray", none))
+    scene = read_scene(tmp_path, "toy", depth_kind="ray")
+    for frame, shot in zip(scene.test, ball_shots("ray")):
+        assert torch.equal(frame.load_depth(), shot.depth)
+    assert f"are {none:.6g}, beyond far, 6: taken for holes" in scene.protocol["assumed"][0]
+
+
+def test_depth_in_another_unit_is_told_with_its_scale(tmp_path):
+    folder = write_dnerf(tmp_path / "toy", (64, 64), test=ball_shots("ray", unit=1000.0))
+    (line, _) = read_scene(tmp_path, "toy").protocol["assumed"]
+    assert line.endswith("with near at 2 and far at 6; write depth_scale: 0.001 beside the frames")
+    edit(folder / "transforms_test.json", {"depth_scale": 1e-3})
+    assert not [line for line in read_scene(tmp_path, "toy").protocol["assumed"] if "in the median" in line]

@@ -314,6 +314,20 @@ def test_pixels_of_alpha_0_are_unknown(tmp_path):
     masks = [frame.load_valid for frame in read_scene(tmp_path, "toy").train]
     assert [mask is not None for mask in masks] == [False, True, False, False]
     assert torch.equal(masks[1](), torch.tensor(rgba[..., 3] > 0))
+    rgba[..., 3] = 0
+    write_image(folder / "rgb" / "2x" / "0_00001.png", rgba)
+    scene = read_scene(tmp_path, "toy")
+    assert [frame.name for frame in scene.train] == ["0_00000", "0_00002", "0_00003"]
+    line = (
+        "alpha is 0 everywhere in 1 images, which are left out (0_00001, ..); if alpha is of other use, set"
+    )
+    assert line in str(scene.protocol["assumed"])
+    for name in ("0_00000", "0_00002", "0_00003"):
+        write_image(folder / "rgb" / "2x" / f"{name}.png", rgba)
+    with refused("0_0000.*png: expected a mask with a bright pixel.*set data.masks=off"):
+        read_scene(tmp_path, "toy")
+    scene = read_scene(tmp_path, "toy", masks="off")
+    assert [frame.load_valid for frame in scene.train] == [None] * 4
 
 
 BAD = {

@@ -304,3 +304,20 @@ def test_one_camera_is_tested_on_moments_alone(tmp_path):
     with refused("a camera or a moment to test on, but got none; name some in"):
         read_scene(tmp_path, "toy")
     assert len(read_scene(tmp_path, "toy", test_moments=[1]).train) == 3
+
+
+def test_films_of_other_names_are_said_or_refused(folder):
+    (folder / "cam02").rename(folder / "left")
+    with refused("a row for each of 2 cameras, cam00, cam01, but got 3 rows, as if left were cameras, too"):
+        read_scene(folder.parent, "toy")
+    write_poses(folder, CAMERAS[:2], near=14.0, far=30.0)
+    (line,) = read_scene(folder.parent, "toy").protocol["assumed"]
+    assert line.endswith("toy: left not read, as names of cameras begin with cam")
+
+
+def test_frames_counted_in_hexadecimal_are_refused(folder):
+    for camera in folder.glob("cam*"):
+        for n, path in enumerate(sorted(camera.iterdir())):
+            path.rename(camera / f"{n + 7:04x}.png")
+    with refused("cam00: expected names that tell the order, but got hexadecimal ones, as 000a"):
+        read_scene(folder.parent, "toy")

@@ -177,3 +177,36 @@ def test_a_pattern_settles_every_case():
 def test_a_pattern_that_cannot_be_used_is_refused(pattern, said):
     with refused(said):
         read_names(in_groups("{}_{:03d}", range(2), (4, 6)), "t.json", pattern)
+
+
+@pytest.mark.parametrize(
+    "form", ["C{:04d}.MP4_frame_{:04d}", "GX01{:04d}_frame_{:04d}", "clip{:02d}/frame_{:04d}"]
+)
+def test_frames_counted_anew_in_each_film_are_refused_without_poses(form):
+    names = [form.format(film, n) for film in (1, 2) for n in range(1, 9)]
+    with refused("films that are counted anew.*name_pattern"):
+        read_names(names, "toy")
+    pattern = r"(?P<part>\d+)(\.MP4)?.frame_(?P<frame>\d+)"
+    assert read_names(names, "toy", pattern).frames == [*map(float, range(1, 17))]
+    assert len({*read_names([f"cam{k}/frame_{n}" for k in (1, 2) for n in range(9)], "toy").cameras}) == 2
+
+
+def test_folders_counted_apart_are_refused_without_poses_unless_one_goes_on():
+    apart = [
+        f"{camera}/{n:04d}" for camera, first in (("a", 1), ("b", 101)) for n in range(first, first + 14)
+    ]
+    with refused("one numbering of all images, 1 to 114, but got 101 to 114 for 'b/0101'"):
+        read_names(apart, "toy")
+    on = [f"{part}/{n:04d}" for part, first in (("a", 1), ("b", 15)) for n in range(first, first + 14)]
+    assert read_names(on, "toy").times[-1] == 1
+    splits = [
+        f"{split}/{n:04d}" for split, first in (("train", 1), ("test", 101)) for n in range(first, first + 14)
+    ]
+    assert read_names(splits, "toy").frames[-1] == 114
+
+
+def test_folders_counted_in_hexadecimal_are_refused_and_hashes_are_not():
+    with refused("'000a/left'.*hexadecimal"):
+        read_names([f"{n:04x}/{side}" for n in range(12) for side in ("left", "right")], "toy")
+    hashes = [f"{folder}/{n:03d}" for folder in ("3fa9", "b01c") for n in range(9)]
+    assert len({*read_names(hashes, "toy").cameras}) == 2

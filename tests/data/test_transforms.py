@@ -4,6 +4,7 @@ import json
 import math
 import re
 import shutil
+from contextlib import nullcontext
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from forewarp.data.checks import check_seen
 from forewarp.data.files import Entry, layout_of
 from forewarp.data.module import DNeRFDataModule
 from forewarp.data.transforms import camera_of, check_times, left_aside, pose_in, times_of, with_intrinsics
+from forewarp.scene.camera import Camera
 from tests.support.written_scenes import around, dnerf_shots, edit, refused, write_dnerf
 
 EYE = torch.eye(4, dtype=torch.float64)
@@ -269,6 +271,33 @@ def test_times_in_two_units_are_refused(train, test, said):
 def test_times_in_one_unit_are_not_refused(train, test):
     times = {"train": train, "test": test}
     check_times({k: {f"{k}/{i}": t for i, t in enumerate(of)} for k, of in times.items()}, "t.json")
+
+
+@pytest.mark.parametrize(
+    ("test", "is_refused"), [(range(20), True), (range(0, 160, 8), False), (range(40), False)]
+)
+def test_a_split_that_counts_its_own_images_is_refused(test, is_refused):
+    """Of a film of 160 images every 8th is tested on; of a list of 40 the first are."""
+    shown = [8 * n for n in test] if is_refused else [*test]
+    at = {"train": [n for n in range(160) if n not in shown], "test": shown}
+    times = {"train": at["train"], "test": test}
+    names = {split: [f"{split}/{i}" for i in range(len(of))] for split, of in times.items()}
+    pose = [torch.eye(4, dtype=torch.float64) for _ in range(160)]
+    for n in range(160):
+        pose[n][0, 3] = 0.1 * n
+    cameras = {}
+    for split, of in at.items():
+        for name, n in zip(names[split], of):
+            cameras[name] = Camera(8, 8, 9.0, 9.0, 4.0, 4.0, pose[n], 0.0, 1.0)
+    given = {split: dict(zip(names[split], of)) for split, of in times.items()}
+    with (
+        refused(
+            "times of test frames: expected one numbering of all images, 0 to 159, but got 0 to 19, where"
+        )
+        if is_refused
+        else nullcontext()
+    ):
+        check_times(given, "t.json", cameras)
 
 
 def test_times_under_another_key_are_named(tmp_path):

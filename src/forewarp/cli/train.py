@@ -37,7 +37,8 @@ What one types most (beside options such as --multirun or --config-dir=FOLDER):
   views=N                             measure N test views, evenly spread, in place of all
   reduce=2                            average 2 x 2 pixels of each test view and of its truth, then score
   data.name_pattern='REGEX'           frame or time (and camera) in images' names that say it in several ways
-  data.depth_kind=axis|ray            measured depth: along the optical axis, or along each pixel's ray
+  data.depth_kind=axis|ray            depth: along the optical axis, or along each pixel's ray
+  data.masks=off                      masks and alpha that say which pixels count are not read
   data.camera_order=number|text       rows of poses_bounds.npy: by number, or as texts (cam1, cam10, cam2)
   data.held_out=N                     hold N training views out and record their PSNR against training time
   dataset=dnerf data.scene=hook       a scene of a dataset below paths.scenes=FOLDER, here FOLDER/dnerf/hook

@@ -1,4 +1,4 @@
-"""Read and write the arrays beside a scene's images: exact depth, exact trajectories, clouds of points."""
+"""Read and write the arrays beside a scene's images: exact trajectories, clouds of points."""
 
 from __future__ import annotations
 
@@ -12,38 +12,11 @@ from torch import Tensor
 
 from forewarp.data.cameras import MOST_UNITS
 from forewarp.data.files import mismatch, numbers_of, opened, read_bytes
-from forewarp.data.images import read_gray16
 from forewarp.files import MOST_ARRAYS, MOST_POINTS, unpack_arrays, written_whole
-from forewarp.ops.grid import reduced_depth
 from forewarp.scene.frame import Truth
 from forewarp.scene.world import SAME, World
 
 _SAME_TIME = 1e-6
-
-
-class StoredDepth:
-    """Ray depth (H, W) float32 in world units, 0 on the background; read at each call.
-
-    A .npy file, or a grey 16-bit PNG whose values times ``scale`` are world units (None is refused).
-    ``size`` (width, height) is what the file must hold; with ``halve`` half of that is given.
-    """
-
-    def __init__(self, path: Path, size: tuple[int, int], halve: bool, scale: float | None) -> None:
-        if path.suffix == ".png" and scale is None:
-            expected = "depth_scale in the transforms file, world units for one step of a 16-bit depth"
-            raise mismatch(path, expected, "none")
-        self.path, self.size, self.halve, self.scale = path, size, halve, scale
-
-    def __call__(self) -> Tensor:
-        """Read the depth; SceneError where the file holds anything else."""
-        depth = read_gray16(self.path) if self.path.suffix == ".png" else load_numpy(self.path)
-        expected = f"finite depths >= 0 of shape {self.size[::-1]}"
-        check_shape(depth, self.path, expected, *self.size[::-1])
-        with np.errstate(over="ignore", invalid="ignore"):  # too large for float32: refused as infinite
-            depth = np.array(depth * (1.0 if self.scale is None else self.scale), np.float32)
-        if not np.isfinite(depth).all() or (depth < 0).any():
-            raise mismatch(self.path, expected, f"values from {depth.min()} to {depth.max()}")
-        return reduced_depth(torch.from_numpy(depth)) if self.halve else torch.from_numpy(depth)
 
 
 def read_truth(path: Path, canonical_time: float, world: World = SAME) -> Truth | None:

@@ -87,8 +87,10 @@ def remarks(scene: Scene) -> Iterator[str]:
             yield f"{line}; write 0 where pixels do not count, or set data.masks=off"
         if share < _FEW:
             advice = "if dark is what lies beside the subject, set data.masks=alpha"
+            advice = advice if scene.protocol.get("dataset") == "video_with_poses" else "set data.masks=off"
             line = f"masks leave {share:.0%} of the pixels to train on"
             yield f"{line}; {advice}, if it is the subject, invert them"
+    yield from _of_motion(scene)
     if scene.still is not None:
         cameras = [frame.camera for frame in scene.train]
         images = [torch.ones((), dtype=torch.bool).expand(c.height, c.width) for c in cameras]
@@ -155,7 +157,7 @@ def _too_wide(scene: Scene, aim: Tensor | None) -> Iterator[str]:
 
 
 def _of_test_images(scene: Scene) -> Iterator[str]:
-    """Compare places, angles and depths of test images with those of training images and the box."""
+    """Compare places and angles of test images with those of training images and the box."""
     if (blind := blind_frames(scene, scene.test)) > _CUT_OFF * len(scene.test):
         line = f"{blind} of {len(scene.test)} test images see nothing of the box {bounds(scene)}"
         yield f"{line}, as if their poses were in other units; write them as those of training images"
@@ -165,18 +167,6 @@ def _of_test_images(scene: Scene) -> Iterator[str]:
     if not min(focal) / _ZOOMED < middle < max(focal) * _ZOOMED:
         line = f"the focal length of test images is {middle:.2g} of their longer side and that of training"
         yield f"{line} images {min(focal):.2g} to {max(focal):.2g}; compare both"
-    deep = next((f for f in (*scene.test, *scene.train) if f.load_depth or f.load_sensed), None)
-    depth = None if deep is None else deep.load_depth() if deep.load_depth else deep.load_sensed()[0]
-    if depth is not None and bool((depth > 0).any()):
-        away, near, far = float(depth[depth > 0].median()), deep.camera.near, deep.camera.far
-        if not near < away < far:
-            depth, near, far = (_length(scene, length) for length in (away, near, far))
-            line = f"{deep.name}: its depth is {depth} in the median, with near at {near} and far at {far}"
-            advice = "write it in the units of the poses"
-            if scene.protocol.get("dataset") == "video_with_poses":
-                advice += ", or set data.depth_scale (0.001 for .npy in millimetres, 0.0002 for TUM's PNG)"
-                advice += ", or data.depth_kind=inverse if it is 1 / depth"
-            yield f"{line}; {advice}"
 
 
 def _aimed(scene: Scene, aim: Tensor) -> Iterator[str]:
@@ -253,6 +243,32 @@ def _silhouettes(scene: Scene, *, bounded: bool) -> Iterator[str]:
     if missed > _CUT_OFF * total:
         line = f"{missed / total:.0%} of the subject's pixels see nothing of the box {bounds(scene)}"
         yield f"{line} between near and far; {_remedy(scene, 'all')}"
+
+
+def _of_motion(scene: Scene) -> Iterator[str]:
+    """Look at a few masks of what moves, and of what does not count: are bright and dark exchanged?"""
+    for what, key in (("moving_path says move", "load_moving"), ("masks hide", "load_valid")):
+        frames = [frame for frame in scene.train if getattr(frame, key) is not None]
+        frames = [frames[i] for i in spread(len(frames), _LOOKED_AT)]
+        marked = [getattr(frame, key)() for frame in frames]
+        marked = marked if key == "load_moving" else [~mask for mask in marked]
+        if not any(bool(mask.any()) for mask in marked):
+            if marked and key == "load_moving":
+                yield f"{what} nothing in all {len(marked)} images looked at; write 255 where something moves"
+            continue
+        share = float(torch.stack([mask.float().mean() for mask in marked]).mean())
+        if scene.still is not None:
+            some = scene.still[:: max(1, len(scene.still) // _PIXELS)].double()
+            on, seen = sightings(some, [frame.camera for frame in frames], marked)
+            of_still = float(on.sum()) / max(float(seen.sum()), 1.0)
+            if of_still > _FEW:
+                line = f"{of_still:.0%} of the points that never move lie in what {what}"
+                yield f"{line}, {share:.0%} of images, as if it were inverted; invert the masks"
+                continue
+        is_turned = sum(map(_is_inverted, marked)) > _FEW * len(marked) or share > _FEW
+        if key == "load_moving" and is_turned:
+            line = f"{what} {share:.0%} of the pixels, as if masks were dark where something moves"
+            yield f"{line}; if so, invert them"
 
 
 def _is_inverted(solid: Tensor) -> bool:

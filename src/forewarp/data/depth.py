@@ -1,11 +1,13 @@
-"""Depth that a sensor measured or another program guessed, beside a scene's images."""
+"""Depth beside a scene's images: exact, measured by a sensor, or guessed by another program."""
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
+from statistics import median
 
 import numpy as np
 import torch
@@ -15,6 +17,7 @@ from forewarp.data.agreement import leaning
 from forewarp.data.arrays import check_shape, load_numpy
 from forewarp.data.files import existing, mismatch
 from forewarp.data.images import CACHE, by, read_gray16, read_image
+from forewarp.ops.grid import reduced_depth
 from forewarp.scene.camera import Camera, Lens
 from forewarp.scene.frame import Frame, spread
 
@@ -25,8 +28,13 @@ LEVELS = 2  # of ARKit's confidence: 0 low, 1 medium, 2 high
 _LOOKED_AT = 4  # files that tell the unit
 _NEAR, _LEAST, _AGREE, _LINES = 0.05, 10, 0.4, 400  # of a fit: share, points, share of them, lines tried
 _VIEWS, _NEXT = 4, (0, 2, 6, 14)  # views that are compared, with others so many later
+_MANY, _PAIRS, _OF_TIME = 400, 12, 0.5  # images of which so many pairs are near; distance of times 0 and 1
 _LEANS = 0.65, 1.5  # between which the other kind is right
 _BEYOND = 2.0  # share of near and far within which the median of depths of the right unit lies
+_NOWHERE = 10.0  # multiple of far, beyond which nothing is measured
+_REPEATED, _SEVERAL = 0.002, 2  # share and number of pixels of the largest depth, from which on it is none
+_UNITS = (1.0, MILLIMETRES, 1e-2, 1e2, 1e3, 2e-4, 1 / 256, 0.0254, 0.3048)  # that depth is written in
+_SAME_UNIT = 0.03
 
 
 @dataclass(eq=False)
@@ -36,8 +44,9 @@ class SensedDepth:
     room; it is read-only.
 
     Args:
-        path: .npy (H', W'), (H', W', 1) or (1, H', W'), or grey PNG of 16 bits, of depths; what is 0 or not
-            finite is a hole. Its proportions are the image's, of which each pixel takes the nearest.
+        path: .npy (H', W'), (H', W', 1) or (1, H', W'), or grey PNG of 16 bits, of depths; what is 0, not
+            finite, or ``nowhere`` within reach of the camera's far, is a hole. Its proportions are the
+            image's, of which each pixel takes the nearest.
         camera: of the image.
         scale: world units for one unit of the file.
         confidence: .npy or grey PNG as large: from 0 to 1, or ARKit's levels 0, 1, 2; None: 1 everywhere.
@@ -68,7 +77,9 @@ class SensedDepth:
         if abs(depth.shape[0] * size[1] - depth.shape[1] * size[0]) > max(*depth.shape, *size):
             expected = f"depths of the proportions of its image, {by(size[::-1])} pixels"
             raise mismatch(self.path, expected, by(depth.shape[::-1]))
-        if self.kind not in METRIC:
+        if self.kind in METRIC:
+            depth[nowhere(depth, self.camera.far / self.scale)] = 0
+        else:
             depth = self._fitted(depth)
         planes = torch.from_numpy(np.stack([depth * self.scale, trust * (depth > 0)]).astype(np.float32))
         planes = torch.nn.functional.interpolate(planes[None], size, mode="nearest-exact")[0]
@@ -76,15 +87,21 @@ class SensedDepth:
             planes[0] /= _cosines(*camera.inner)
         return planes
 
-    def _fitted(self, values: np.ndarray) -> np.ndarray:
-        """Return depths (H, W) in world units of values up to a scale and a shift, NaN where there is none; 0
-        everywhere where points do not tell.
+    def at_known(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return those of ``values`` (H', W') where the camera sees ``known`` points, and the depths of these
+        along the axis, world units, (P,) each.
         """
         pixel, z = self.camera.project(self.known.double())
         size = pixel.new_tensor([self.camera.width, self.camera.height])
         inside = (z > 0) & (pixel >= 0).all(-1) & (pixel < size).all(-1)
         at = (pixel[inside] / size * pixel.new_tensor(values.shape[::-1])).long().numpy()
-        given, true = values[at[:, 1], at[:, 0]], z[inside].numpy()
+        return values[at[:, 1], at[:, 0]], z[inside].numpy()
+
+    def _fitted(self, values: np.ndarray) -> np.ndarray:
+        """Return depths (H, W) in world units of values up to a scale and a shift, NaN where there is none; 0
+        everywhere where points do not tell.
+        """
+        given, true = self.at_known(values)
         true, there = 1 / true if self.kind == "inverse" else true, np.isfinite(given)
         found = line_through(given[there], true[there])
         if found is None:
@@ -93,6 +110,42 @@ class SensedDepth:
             depth = found[0] * values + found[1]
             depth = 1 / depth if self.kind == "inverse" else depth
             return np.where(np.isfinite(depth) & (depth > 0), depth, 0.0)
+
+
+class StoredDepth:
+    """Exact ray depth (H, W) float32 in world units, 0 on the background; read at each call.
+
+    Args:
+        path: .npy, or a grey 16-bit PNG; what is ``nowhere`` in reach of the camera's far is background.
+        camera: of the image as stored, whose size the file must have.
+        halve: give half the size.
+        scale: world units for one of the file; None: 1, refused for a PNG.
+        kind: in the file along the optical ``axis`` or each pixel's ``ray``.
+    """
+
+    def __init__(self, path: Path, camera: Camera, halve: bool, scale: float | None, kind: str) -> None:
+        if path.suffix == ".png" and scale is None:
+            expected = "depth_scale in the transforms file, world units for one step of a 16-bit depth"
+            raise mismatch(path, expected, "none")
+        self.path, self.camera, self.halve, self.kind = path, camera, halve, kind
+        self.scale = 1.0 if scale is None else scale
+
+    def __call__(self) -> Tensor:
+        """Read the depth; SceneError where the file holds anything else."""
+        values = read_gray16(self.path) if self.path.suffix == ".png" else load_numpy(self.path)
+        size = self.camera.height, self.camera.width
+        expected = f"finite depths >= 0 of shape {size}"
+        check_shape(values, self.path, expected, *size)
+        depth = values.astype(np.float64)
+        if not np.isfinite(depth).all() or (depth < 0).any():
+            raise mismatch(self.path, expected, f"values from {depth.min()} to {depth.max()}")
+        depth[_are_full(values) | nowhere(depth, self.camera.far / self.scale)] = 0
+        if not (depth.max() * self.scale <= np.finfo(np.float32).max):
+            raise mismatch(self.path, expected, f"values up to {depth.max() * self.scale}")
+        depth = torch.from_numpy((depth * self.scale).astype(np.float32))
+        if self.kind == "axis":
+            depth = depth / _cosines(*self.camera.inner)
+        return reduced_depth(depth) if self.halve else depth
 
 
 def line_through(given: np.ndarray, true: np.ndarray) -> tuple[float, float] | None:
@@ -124,31 +177,151 @@ def line_through(given: np.ndarray, true: np.ndarray) -> tuple[float, float] | N
     return float(a), float(b)
 
 
-def doubt_kind(frames: Sequence[Frame], known: Tensor | None, kind: str | None, where: object) -> list[str]:
-    """Doubt that depth is along the axis, or along the rays, where views agree with the other: refuse it, or
-    say so in a line if the kind was typed.
+def nowhere(depth: np.ndarray, far: float) -> np.ndarray:
+    """Tell which depths (H, W) are a program's number for none: the largest, if several pixels have just that
+    and it is beyond ``far``, and what is beyond ten times that, unless most depths are. Returns bool (H, W).
+
+    >>> nowhere(np.array([[2.0, 3, 65.535, 65.535]]), 10.0).tolist()
+    [[False, False, True, True]]
+    """
+    largest = _repeated(depth) & (depth > far)
+    rest = depth[(depth > 0) & ~largest]
+    if not rest.size or np.median(rest) > _NOWHERE * far:  # of another unit
+        return np.zeros_like(largest)
+    return largest | (depth > _NOWHERE * far)
+
+
+def _repeated(depth: np.ndarray) -> np.ndarray:
+    """Tell which of depths (H, W) are the largest, if several pixels have just that."""
+    largest = (depth == depth.max()) & (depth > 0)
+    return largest & bool(largest.sum() >= max(_SEVERAL, _REPEATED * depth.size))
+
+
+def doubt_depths(
+    frames: Sequence[Frame], world: float, kind: str | None, where: object, unit: str, usual: str = "axis"
+) -> list[str]:
+    """Say in lines which numbers of metric depths are taken for holes, and that depths are in another unit;
+    else doubt their kind.
 
     Args:
-        frames: in the order of time; some of those with depth are read, less what moves where that is known.
-        known: points (N, 3) that never move, world units.
-        kind: as typed; None is the axis.
-        where: of the error.
+        frames: in the order of time; some of those with depth are read.
+        world: scene units for one unit of the file's world.
+        kind: as typed, see ``doubt_kind``.
+        where: what depths belong to.
+        unit: what to do with the number that is the unit, ``set data.depth_scale={}``.
+        usual: the kind if none was typed: axis, as of films, or ray, as of images from all around.
 
     Raises:
-        SceneError: naming the key.
+        SceneError: as ``doubt_kind``.
     """
     frames = [frame for frame in frames if frame.load_sensed is not None]
     if kind not in (*METRIC, None) or not frames:
         return []
-    chosen = sorted({i + n for i in spread(len(frames), _VIEWS) for n in _NEXT if i + n < len(frames)})
-    some, taken = [frames[i] for i in chosen], kind or METRIC[0]
+    loads = [frames[i].load_sensed for i in spread(len(frames), _LOOKED_AT)]
+    near, far = loads[0].camera.near / world, loads[0].camera.far / world
+    holes, kept, pixels = {"the largest of their type": [], f"beyond far, {far:.4g}": []}, [], 0
+    for load in loads:
+        values, depth = _numbers_in(load.path), read_depth(load.path)
+        away = nowhere(depth, load.camera.far / load.scale)
+        for found, mask in zip(holes.values(), (_are_full(values), away)):
+            found.append(values[mask].astype(np.float64))
+        kept.append(depth[(depth > 0) & ~away] * load.scale / world)
+        pixels += depth.size
+    lines = []
+    for why, found in holes.items():
+        if (found := np.concatenate(found)).size:
+            most = Counter(found.tolist()).most_common(1)[0][0]
+            more = "" if (found == most).all() else " and other numbers"
+            line = f"{found.size / pixels:.2%} of the depths looked at are {most:.6g}{more}, {why}"
+            advice = "; set data.far if they are right" if "far" in why else ""
+            lines.append(f"{where}: {line}: taken for holes{advice}")
+    there = np.concatenate(kept)
+    if there.size and not near < (middle := float(np.median(there))) < far:
+        got = f"depth is {middle:.4g} in the median, with near at {near:.4g} and far at {far:.4g}"
+        told = fitting_unit(middle * world / loads[0].scale, near, far, _told_by_points(loads, world))
+        also = "" if loads[0].known is None else ", or data.depth_kind=inverse if it is 1 / depth"
+        return [*lines, f"{where}: {got}; {unit.format(told)}{also}"]
+    groups = _near_pairs(frames)
+    if usual == "axis":
+        chosen = {i + n for i in spread(len(frames), _VIEWS) for n in _NEXT if i + n < len(frames)}
+        groups = [[frames[i] for i in sorted(chosen)]]
+    return lines + doubt_kind(groups, loads[0].known, kind, where, usual)
+
+
+def _near_pairs(frames: Sequence[Frame]) -> list[list[Frame]]:
+    """Choose pairs of frames whose cameras stand near each other, at about one time: from elsewhere much is
+    hidden.
+    """
+    frames = [frames[i] for i in spread(len(frames), _MANY)]
+    places = torch.stack([frame.camera.center.double() for frame in frames])
+    times = torch.tensor([frame.time for frame in frames], dtype=torch.float64)[:, None]
+    apart = torch.cdist(places, places) / float((places - places.mean(0)).norm(dim=-1).mean().clamp(min=1e-9))
+    apart = (apart + _OF_TIME * (times - times.T).abs()).triu(1)
+    apart[apart == 0] = torch.inf
+    first, second = torch.unravel_index(apart.flatten().argsort()[:_PAIRS], apart.shape)
+    return [[frames[i], frames[j]] for i, j in zip(first.tolist(), second.tolist()) if i < j]
+
+
+def _told_by_points(loads: Sequence[SensedDepth], world: float) -> float | None:
+    """Return how many units of the file's world one of depth is, as points that never move tell; None where
+    they do not.
+    """
+    shares = []
+    for load in loads:
+        if load.known is not None:
+            values, true = load.at_known(read_depth(load.path))
+            shares += (true[values > 0] / values[values > 0]).tolist()
+    if len(shares) < _LEAST:
+        return None
+    middle = float(np.median(shares))
+    agree = np.abs(np.array(shares) / middle - 1) < 2 * _NEAR
+    return middle / world if agree.mean() >= _AGREE else None
+
+
+def fitting_unit(median: float, near: float, far: float, told: float | None = None) -> str:
+    """Write by which number depths are to be multiplied, that their median lies between near and far: usual
+    units, or what is ``told`` otherwise, or from where to where.
+
+    >>> fitting_unit(4000.0, 1.0, 10.0), fitting_unit(4.1, 200.0, 300.0)
+    ('0.001', '49 to 73')
+    """
+    if told is not None:
+        like = (unit for unit in _UNITS if abs(told / unit - 1) < _SAME_UNIT)
+        return f"{next(like, told):.4g}"
+    fits = [f"{unit:.4g}" for unit in _UNITS if near < unit * median < far]
+    return " or ".join(fits) if fits else f"{near / median:.2g} to {far / median:.2g}"
+
+
+def doubt_kind(
+    groups: Sequence[Sequence[Frame]], known: Tensor | None, kind: str | None, where: object, usual: str
+) -> list[str]:
+    """Doubt that depth is along the axis, or along the rays, where views agree with the other: refuse it, or
+    say so in a line if the kind was typed.
+
+    Args:
+        groups: of frames with depth, which are compared, less what moves where that is known.
+        known: points (N, 3) that never move, world units.
+        kind: as typed; None is ``usual``.
+        where: of the error.
+        usual: axis or ray.
+
+    Raises:
+        SceneError: naming the key.
+    """
+    taken = kind or usual
     other = METRIC[1 - METRIC.index(taken)]
-    readings = [[_still(frame, each) for frame in some] for each in (taken, other)]
-    found = leaning([frame.camera for frame in some], readings, known)
-    if found is None or not _LEANS[0] < found[0] < _LEANS[1] or found[2] > found[1]:
+    leans = []
+    for some in groups:
+        readings = [[_still(frame, each) for frame in some] for each in (taken, other)]
+        leans.append(leaning([frame.camera for frame in some], readings, known))
+    leans = [found for found in leans if found is not None]
+    if not leans:
+        return []
+    share, mine, others = map(median, zip(*leans))
+    if not _LEANS[0] < share < _LEANS[1] or others > mine:
         return []
     along = {"axis": "along the optical axis", "ray": "along the pixels' rays"}
-    got = f"depths of which views differ by {found[1]:.2%}, and by {found[2]:.2%} if they are {along[other]}"
+    got = f"depths of which views differ by {mine:.2%}, and by {others:.2%} if they are {along[other]}"
     if kind is None:
         advice = f"set data.depth_kind={other}, or data.depth_kind={taken} if they are right"
         raise mismatch(where, f"depths {along[taken]}", got, advice)
@@ -221,19 +394,15 @@ def _stored(folder: Path, name: str) -> Path | None:
 
 def read_depth(path: Path, *, signed: bool = False) -> np.ndarray:
     """Read depths (H, W) float64 of a file as ``SensedDepth`` takes them, holes as 0; ``signed``: any values,
-    holes as NaN. Of whole numbers the largest of their type (65535 of a PNG) is a hole unless ``signed``.
+    holes as NaN. The largest number of their type (65535 of a PNG) is a hole unless ``signed``.
 
     Raises:
         SceneError: for another shape, and for a depth below 0.
     """
-    depth = read_gray16(path) if path.suffix == ".png" else load_numpy(path)
-    shape = getattr(depth, "shape", ())
-    depth = depth[..., 0] if shape[2:] == (1,) else depth[0] if len(shape) == 3 and shape[0] == 1 else depth
-    check_shape(depth, path, "depths (H, W)", None, None)
-    is_full = depth == np.iinfo(depth.dtype).max if depth.dtype.kind in "iu" else None
-    depth = np.array(depth, np.float64)
-    if is_full is not None and not signed:
-        depth[is_full] = 0
+    values = _numbers_in(path)
+    depth = values.astype(np.float64)
+    if not signed:
+        depth[_are_full(values)] = 0
     depth[~np.isfinite(depth)] = np.nan if signed else 0
     if signed:
         return depth
@@ -242,11 +411,29 @@ def read_depth(path: Path, *, signed: bool = False) -> np.ndarray:
     return depth
 
 
+def _numbers_in(path: Path) -> np.ndarray:
+    """Read the numbers (H, W) of a file of depths."""
+    return _plane(read_gray16(path) if path.suffix == ".png" else load_numpy(path), path, "depths (H, W)")
+
+
+def _plane(values: object, path: Path, expected: str) -> np.ndarray:
+    """Check numbers (H, W), (H, W, 1) or (1, H, W) of a file and return them as (H, W)."""
+    shape = getattr(values, "shape", ())
+    if len(shape) == 3 and 1 in (shape[0], shape[2]):
+        values = values[..., 0] if shape[2] == 1 else values[0]
+    check_shape(values, path, expected, None, None)
+    return values
+
+
+def _are_full(values: np.ndarray) -> np.ndarray:
+    """Tell which numbers are the largest of their type."""
+    return values == (np.finfo if values.dtype.kind == "f" else np.iinfo)(values.dtype).max
+
+
 def _read_confidence(path: Path) -> np.ndarray:
     """Read confidences (H, W) in [0, 1]: levels and bytes are whole numbers."""
     values = read_image(path)[..., 0].numpy() if path.suffix == ".png" else load_numpy(path)
-    values = values[..., 0] if getattr(values, "ndim", 0) == 3 else values
-    check_shape(values, path, "confidences (H, W)", None, None)
+    values = _plane(values, path, "confidences (H, W)")
     most = 1.0 if values.dtype.kind == "f" else float(LEVELS if values.max() <= LEVELS else 255)
     if not (values.min() >= 0 and values.max() <= most):
         got = f"values from {values.min():g} to {values.max():g}"
@@ -275,7 +462,8 @@ def unit_of(paths: Sequence[Path], near: float, far: float) -> tuple[float, list
         SceneError: where neither does, or all are holes.
     """
     depths = [read_depth(paths[i]) for i in spread(len(paths), _LOOKED_AT)]
-    there = np.concatenate([depth[depth > 0] for depth in depths])
+    shown = [depth[(depth > 0) & ~_repeated(depth)] for depth in depths]
+    there = np.concatenate(shown if any(map(len, shown)) else [depth[depth > 0] for depth in depths])
     if not there.size:
         raise mismatch(paths[0].parent, "depths above 0", "holes alone")
     median = float(np.median(there))
@@ -284,4 +472,5 @@ def unit_of(paths: Sequence[Path], near: float, far: float) -> tuple[float, list
             line = "depths are taken for thousandths of the cameras' unit, as near and far say"
             return unit, [] if unit == 1 else [f"{paths[0].parent}: {line}"]
     expected = f"depths between near and far, {near:.4g} and {far:.4g} in the cameras' unit, or thousandths"
-    raise mismatch(paths[0].parent, expected, f"{median:.4g} in the median", "write them in that unit")
+    advice = f"multiply them by {fitting_unit(median, near, far)}"
+    raise mismatch(paths[0].parent, expected, f"{median:.4g} in the median", advice)

@@ -3,7 +3,7 @@
 A pose on disk is camera-to-world with OpenGL's axes (x right, y up, looking along -z); reading and writing
 negate its y and z columns. Beside the stock ``transforms_test.json`` a scene may bring one file per
 ability (``transforms_test_space.json``, ``..._time.json``, ``..._canonical.json``), exact ray depth
-(``depth_file_path``: float32 .npy, or 16-bit PNG times the file's ``depth_scale``, 0 = background) and
+(``depth_file_path``: .npy, or 16-bit PNG, times the file's ``depth_scale``, 0 = background) and
 ``trajectories.npz`` (``points`` (N, T, 3), ``times`` (T,)). ``test_space/transforms.json`` serves as well.
 A frame's ``mask_path`` cuts its image out.
 
@@ -23,7 +23,7 @@ from pathlib import Path
 import numpy as np
 from torch import Tensor
 
-from forewarp.data.arrays import StoredDepth, read_truth, write_array, write_truth
+from forewarp.data.arrays import read_truth, write_array, write_truth
 from forewarp.data.cameras import (
     SPLITS,
     Normalisation,
@@ -33,8 +33,19 @@ from forewarp.data.cameras import (
     opengl_rows,
     space_of,
 )
+from forewarp.data.depth import METRIC, SensedDepth, StoredDepth, doubt_depths
 from forewarp.data.directions import check_directions, common_point
-from forewarp.data.files import mismatch, nearly, number, one_of, read_json, remove, scene_folder, whole
+from forewarp.data.files import (
+    RECORD,
+    mismatch,
+    nearly,
+    number,
+    one_of,
+    read_json,
+    remove,
+    scene_folder,
+    whole,
+)
 from forewarp.data.images import StoredImage, alpha_of, by, check_pixels, inspect_image, write_image
 from forewarp.data.transforms import (
     ListedImage,
@@ -103,6 +114,7 @@ def read_scene(
     test_every: int = 8,
     name_pattern: str | None = None,
     alpha: str | None = None,
+    depth_kind: str | None = None,
 ) -> Scene:
     """Read ``root/scene``; pixels are decoded when a frame is first loaded.
 
@@ -122,10 +134,13 @@ def read_scene(
         test_every: every n-th training image is tested on where there are no test images.
         name_pattern: see ``posed_video.read_scene``.
         alpha: colours are ``straight`` or ``premultiplied``; None: as the edges of some images show.
+        depth_kind: of ``depth_file_path``, along the optical ``axis`` or each pixel's ``ray``; None: ray,
+            unless views agree much better along the axis, which is refused.
 
     Raises:
         SceneError: for every file or value that is missing or wrong, with file and key.
     """
+    one_of(depth_kind, "data.depth_kind", *METRIC, None)
     near, far = number_or_none(near, "data.near"), number_or_none(far, "data.far")
     one_of(angle, "data.angle", "width", "longer")
     one_of(half_resolution, "data.half_resolution", True, False, "auto")
@@ -147,13 +162,21 @@ def read_scene(
     space, bounds = _space(cameras, str(folder), near, far, box, has_alpha, is_metric)
 
     def frame(record: _Record) -> Frame:
-        camera = space.camera(record.camera)
-        camera = camera.resized(width, height) if halve else camera
+        whole = space.camera(record.camera)
+        camera = whole.resized(width, height) if halve else whole
         load = StoredImage(record.path, size, 1 + halve, record.mask, premultiplied=premultiplied)
-        depth = StoredDepth(record.depth[0], size, halve, record.depth[1]) if record.depth else None
+        depth = None
+        if record.depth:
+            depth = StoredDepth(record.depth[0], whole, halve, record.depth[1], depth_kind or "ray")
         return Frame(_name(folder, record), record.time, camera, load, depth, record.ability)
 
     train, val, test = (tuple(map(frame, records[split])) for split in SPLITS)
+    deep = sorted((f for f in (*train, *val, *test) if f.load_depth), key=lambda f: f.time)
+    advice = "write depth_scale: {} beside the frames"
+    assumed += doubt_depths([*map(_sensed, deep)], space.scale, depth_kind, folder, advice, usual="ray")
+    if deep and depth_kind is None and not any((place / RECORD).is_file() for place in (folder, Path(root))):
+        line = "depth_file_path is taken for depth along the pixels' rays"
+        assumed.append(f"{folder}: {line}; if it is along the optical axis, set data.depth_kind=axis")
     canonical = min(f.time for f in train)
     protocol = {"dataset": "dnerf", "resolution": [width, height], "half_resolution": halve}
     is_moved = space.scale != 1 or any(space.center)
@@ -161,6 +184,12 @@ def read_scene(
     protocol["assumed"] = [*dict.fromkeys(assumed)] or None
     truth = read_truth(folder / "trajectories.npz", canonical)
     return Scene(scene, train, val, test, bounds, canonical, has_alpha, truth, protocol, world=space)
+
+
+def _sensed(frame: Frame) -> Frame:
+    """Give a frame its exact depth as measured, to doubt it."""
+    depth = frame.load_depth
+    return replace(frame, load_sensed=SensedDepth(depth.path, frame.camera, depth.scale, kind=depth.kind))
 
 
 def _space(
@@ -227,7 +256,7 @@ def _read_records(
     times, told = times_of(names, [record.time for record in everything], str(folder), name_pattern, cameras)
     assumed += [told] if told else []
     given = {split: {_name(folder, record): record.time for record in records[split]} for split in SPLITS}
-    check_times(given, str(folder))
+    check_times(given, str(folder), dict(zip(names, cameras)))
     each = iter(times)
     records = {split: [replace(record, time=next(each)) for record in records[split]] for split in SPLITS}
     if not records["test"]:

@@ -31,7 +31,7 @@ from torch import Tensor
 from forewarp.data import files
 from forewarp.data.arrays import read_cloud, read_truth, write_array, write_truth
 from forewarp.data.cameras import MOST_UNITS, Normalisation, box_of, check_camera, frustum_box, pose_of
-from forewarp.data.depth import METRIC, SensedDepth, depths_beside, doubt_kind, unit_of
+from forewarp.data.depth import METRIC, SensedDepth, depths_beside, doubt_depths, unit_of
 from forewarp.data.directions import by_translation, opposite, other_readings, transposed
 from forewarp.data.files import (
     Entry,
@@ -104,8 +104,9 @@ def read_scene(
     depth: str | None = None,
     depth_kind: str | None = None,
     split: str | None = None,
+    masks: str | None = None,
 ) -> Scene:
-    """Read ``root/scene``; pixels are decoded when a frame is first loaded.
+    """Read ``root/scene``; pixels are decoded when a frame is first loaded, of images with alpha at once.
 
     With ``val_ids`` these are tested and ``train_ids`` trained on (split "vrig"). Without, every fourth item
     from the first is trained on and those midway between are tested (split "interpolation"). The canonical
@@ -119,12 +120,15 @@ def read_scene(
             agree much better along rays, which is refused.
         split: ``mono``, ``intl`` or another ending of names in ``splits/``: ``train_mono``, ``val_mono``;
             None: ``train`` and ``val``, where these are there, else the lists of ``dataset.json``.
+        masks: ``off``: images' alpha means nothing; None: pixels of alpha 0 do not count, and images of which
+            none does are left out.
 
     Raises:
         SceneError: for every file or value that is missing or wrong, with file and key.
     """
     folder = scene_folder(root, scene, "HyperNeRF")
     one_of(depth_kind, "data.depth_kind", *METRIC, None)
+    one_of(masks, "data.masks", "off", None)
     images = folder / "rgb" / f"{whole(scale, 'data.scale', 1)}x"
     if not images.is_dir():
         there = ", ".join(in_order(p.name for p in folder.glob("rgb/*x") if p.is_dir())) or "none"
@@ -170,7 +174,7 @@ def read_scene(
         header, options = inspect_image(path, size, f", the camera's image_size / {scale}"), {}
         if header.is_turned:
             turned.append(path)
-        if header.has_alpha:
+        if header.has_alpha and masks is None:
             options["load_valid"] = StoredMask(path, size, of_alpha=True)
         if item in depths:
             trust = folder / "confidence" / f"{scale}x" / f"{item}.npy"
@@ -187,11 +191,20 @@ def read_scene(
         time = (numbers[item] - first) / ((last - first) or 1)
         return Frame(item, time, camera, load, camera_id=camera_ids[item], **options)
 
-    train, test = (tuple(map(frame, items)) for items in (train_ids, test_ids))
-    assumed += doubt_kind(train, None, depth_kind, folder / (depth or ""))
-    splits = {"train": train_ids, "val": test_ids}
-    numbered = {split: {item: numbers[item] for item in items} for split, items in splits.items()}
-    check_times(numbered, str(folder / "metadata.json"))
+    everything = [tuple(map(frame, items)) for items in (train_ids, test_ids)]
+    masked = {f.name: f.load_valid for part in everything for f in part if f.load_valid is not None}
+    dark = {name: mask for name, mask in masked.items() if mask.is_dark()}
+    train, test = (tuple(f for f in part if f.name not in dark) for part in everything)
+    if dark:
+        if not train or not test:
+            next(iter(dark.values()))()  # refuses it
+        line = f"alpha is 0 everywhere in {len(dark)} images, which are left out ({min(dark)}, ..)"
+        assumed.append(f"{images}: {line}; if alpha is of other use, set data.masks=off")
+    assumed += doubt_depths(train, size, depth_kind, folder / (depth or ""), "multiply it by {}")
+    splits = {"train": train, "val": test}
+    numbered = {split: {f.name: numbers[f.name] for f in part} for split, part in splits.items()}
+    by_name = {f.name: f.camera for f in (*train, *test)}
+    check_times(numbered, str(folder / "metadata.json"), by_name)
     if first == last:
         assumed.append(f"{folder / 'metadata.json'}: all items are of time {first}: one moment")
     canonical, points = middle_of(f.time for f in train), folder / "points.npy"

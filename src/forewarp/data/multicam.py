@@ -27,6 +27,7 @@ from forewarp.data.agreement import SIDE, photo_error
 from forewarp.data.arrays import check_shape, load_numpy
 from forewarp.data.cameras import MOST_UNITS, box_of, number_or_none, pose_of, space_of
 from forewarp.data.directions import inverted, refuse_other_readings
+from forewarp.data.files import SIDE as SIDE_FILES
 from forewarp.data.files import (
     SUFFIXES,
     SceneError,
@@ -48,7 +49,7 @@ from forewarp.data.images import (
     inspect_image,
     read_image,
 )
-from forewarp.data.names import in_order, read_names
+from forewarp.data.names import hexadecimal, in_order, read_names
 from forewarp.data.rigs import held_cameras, held_moments, split_rig
 from forewarp.data.video import VIDEOS, extracted, stamps_of
 from forewarp.files import written_whole
@@ -128,12 +129,21 @@ def read_scene(
     folder = scene_folder(root, scene, "DyNeRF")
     one_of(normalise, "data.normalise", True, False)
     scale, every = whole(scale, "data.scale", 1), whole(test_every, "data.test_every", 1)
-    paths = _paths(folder)
+    paths, others = _paths(folder)
     one_of(camera_order, "data.camera_order", "number", "text", None)
     tracks = [_look(path) for path in paths.values()]
     images = lambda: [small_image(_first_image(track)) for track in tracks]  # noqa: E731
     key = "set data.camera_order=number or data.camera_order=text"
+    rows = getattr(load_numpy(folder / FILE), "shape", ())[:1] if others else ()
+    if rows == (len(paths) + len(others),):
+        expected = f"a row for each of {len(paths)} cameras, {', '.join(list(paths)[:3])}"
+        got = f"{rows[0]} rows, as if {', '.join(others[:3])} were cameras, too"
+        advice = "name all cameras cam00, cam01 .. in the order of the rows"
+        raise mismatch(folder / FILE, expected, got, advice)
     whole_cameras, ordered = ordered_rows(folder / FILE, list(paths), images, camera_order, key)
+    if others:
+        some = ", ".join(others[:3]) + ", .." * (len(others) > 3)
+        ordered.append(f"{folder}: {some} not read, as names of cameras begin with cam")
     count, assumed = _moments(tracks, None if frames is None else whole(frames, "data.frames", 1), folder)
     turned = [path for track in tracks for path in track.images[:count] if path in track.turned]
     assumed += ordered + exif_turned(turned, folder)
@@ -218,16 +228,19 @@ def write_poses(folder: str | Path, cameras: Sequence[Camera], *, near: float, f
         np.save(beside, np.array(rows))
 
 
-def _paths(folder: Path) -> dict[str, Path]:
-    """Find the video or the folder of frames of each camera, by name, in the order of numbers."""
+def _paths(folder: Path) -> tuple[dict[str, Path], list[str]]:
+    """Find the video or the folder of frames of each camera, by name, in the order of numbers, and names of
+    other videos and folders of images.
+    """
     found = {path.stem: path for path in folder.glob("cam*") if path.suffix.lower() in VIDEOS}
     for path in folder.glob("cam*/"):
         inner = next((place for place in (path, path / "images") if _images(place)), None)
         found |= {} if inner is None else {path.name: inner}
+    there = [path for path in folder.glob("[!.]*") if path.suffix.lower() in VIDEOS]
+    deep = [path for path in folder.glob("[!.]*/") if _images(path) or _images(path / "images")]
     if not found:
         expected = "a video for each camera, cam00.mp4, or a folder of its frames, cam00/"
-        there = [path for path in folder.glob("[!.]*") if path.suffix.lower() in VIDEOS]
-        there = there or [path for path in folder.glob("[!.]*/") if _images(path) or _images(path / "images")]
+        there = there or deep
         got, advice = "neither", ""
         if layout_of(folder) == "LLFF":
             advice = "of images/ by one camera that moves: use experiment=video_with_poses"
@@ -236,7 +249,9 @@ def _paths(folder: Path) -> dict[str, Path]:
             got = f"{len(there)} of other names, as {first}"
             advice = f"rename them to cam00{kind}, cam01{kind} .. in the order of the rows of {FILE}"
         raise mismatch(folder, expected, got, advice)
-    return {name: found[name] for name in in_order(found)}
+    others = {path.name for path in (*there, *deep) if path.stem not in found and path.name not in found}
+    others = in_order(name for name in others if not SIDE_FILES.search(name))
+    return {name: found[name] for name in in_order(found)}, others
 
 
 def _images(folder: Path) -> list[Path]:
@@ -329,6 +344,9 @@ def _look(path: Path) -> _Track:
     """Find the size and number of a camera's frames."""
     if path.is_dir():
         images, turned, size = tuple(_images(path)), set(), None
+        if (odd := hexadecimal([image.stem for image in images])) is not None:
+            advice = "rename images by decimal numbers"
+            raise mismatch(path, "names that tell the order", f"hexadecimal ones, as {odd}", advice)
         for image in images:
             header = inspect_image(image, size, " as the first")
             size = header.size

@@ -32,12 +32,18 @@ _SECONDS_NANOSECONDS = re.compile(r"(?<!\d)(\d{9,10})[_-](\d{9})(?!\d)")
 _FRAME_WORD = re.compile(r"(?i)(?:^|[^a-z])(frame|time|t)[_-]?$")
 _CAMERA_WORD = re.compile(r"(?i)(?:^|[^a-z])(cam|camera|view|sensor|c|v)[_( -]*$")
 _LETTER_WORD = re.compile(r"(?i)(?:^|[^a-z])[cv][_( -]*$")  # before two digits at most: C0001 is a clip
+# Before a number: of films that cameras count, or that are cut into parts.
+_FILM_WORD = re.compile(
+    r"(?i)(?:^|[^a-z])(c|gx|gh|gopr|gp|mvi|dsc|img|vid|mov|dji|clip|part|chapter|take|seg)[_-]?$"
+)
+_OF_FILM = re.compile(r"(?i)^\.(mp4|mov|mkv|avi|m4v|mts|webm)")  # behind it
 _SPLIT_WORD = re.compile(r"(?i)(?:^|/)(train|val|valid|validation|eval|test)\b")
 _OF_TIME = re.compile(r"(?:(\d+)[h:_.-])?(\d{1,2})[m:_.-](\d\d(?:[.,]\d+)?)s?")  # of a group ``time``
 _EXPONENT = re.compile(r"\d\.\d*[eE][-+]?\d")
 _HEXADECIMAL = re.compile(r"[0-9a-f]+|[0-9A-F]+")
 _CLOCK = re.compile(r"([01]\d|2[0-3])([0-5]\d)([0-5]\d)?")  # digits that may be a time of day
 _ODD = 0.2  # share of the names that may have another form than all others, and are then named in the error
+_GAPS = 4  # numbers for one that is there, in a counter with gaps
 _LEAST_WORDS = 4  # different texts beside the numbers, from which on these may tell nothing
 _CARRY = 3.0  # steps of the last number from its end and its beginning within which it is carried over
 _ODD_ALONE = 4  # images of a camera from which on one of a single image is an odd name
@@ -249,7 +255,7 @@ def _by_pattern(names: Sequence[str], where: str, pattern: str) -> NameNumbers:
         parts = [match["part"] or "" for match in matches]
         rank = {part: str(n) for n, part in enumerate(in_order({*parts}))}
         rows = [["", rank[part], "", f"{frame:.10g}"] for part, frame in zip(parts, frames)]
-        frames = _ranked(rows, [1, 3])
+        frames = _ranked(rows, [1, 3], may_carry=False)
     cameras = [match["camera"] for match in matches] if "camera" in compiled.groupindex else None
     reading = _Reading("", frames, [(camera,) for camera in cameras or [""] * len(names)])
     if not reading.is_unique:
@@ -266,12 +272,34 @@ def _by_pattern(names: Sequence[str], where: str, pattern: str) -> NameNumbers:
 
 
 def hexadecimal(names: Sequence[str]) -> str | None:
-    """Find a name whose counter has letters a to f where others have digits; None where there is none.
+    """Find a name whose counter, or that of a folder, has letters a to f where others have digits; None where
+    there is none.
 
     >>> hexadecimal(["r_0009", "r_000a"]), hexadecimal(["9", "a", "10"]), hexadecimal(["1a", "1b", "2a"])
     ('r_000a', 'a', None)
+    >>> hexadecimal(["0009/left", "000a/left"]), hexadecimal(["3fa9/1", "b01c/1"])
+    ('000a/left', None)
     """
-    fields = [re.split(r"[^0-9A-Za-z]+", name.rpartition("/")[2]) for name in names]
+    paths = [name.split("/") for name in names]
+    if len({*map(len, paths)}) > 1:
+        paths = [path[-1:] for path in paths]
+    for place, parts in enumerate(zip(*paths)):
+        found = _hexadecimal(parts)
+        if found is not None and (place == len(paths[0]) - 1 or _is_counter({*parts})):
+            return names[parts.index(found)]
+    return None
+
+
+def _is_counter(parts: set[str]) -> bool:
+    """Tell whether what differs in names, read as hexadecimal, hardly has gaps; hashes have."""
+    prefix = os.path.commonprefix(list(parts)).rstrip("0123456789")
+    numbers = [int(part.removeprefix(prefix), 16) for part in parts]
+    return max(numbers) - min(numbers) < _GAPS * len(numbers)
+
+
+def _hexadecimal(names: Sequence[str]) -> str | None:
+    """Find as ``hexadecimal`` one of the last parts of names."""
+    fields = [re.split(r"[^0-9A-Za-z]+", name) for name in names]
     if len({*map(len, fields)}) > 1:
         return None
     for values in zip(*fields):
@@ -357,6 +385,11 @@ def _camera_word(rows: Sequence[Sequence[str]], place: int) -> bool:
     """Tell whether a word for cameras stands before a number in all names; a letter, before two digits."""
     is_short = all(len(row[place]) <= 2 for row in rows)
     return _word(rows, place, _CAMERA_WORD) and (is_short or not _word(rows, place, _LETTER_WORD))
+
+
+def _tells_film(rows: Sequence[Sequence[str]], place: int) -> bool:
+    """Tell whether a number is that of a film in all names, as ``C0001.MP4_frame_07`` has it."""
+    return _word(rows, place, _FILM_WORD) or all(_OF_FILM.match(row[place + 1]) for row in rows)
 
 
 def _joined_fraction(rows: list[list[str]], place: int) -> bool:
@@ -448,6 +481,10 @@ def _chosen(
         is_film = is_shared and views is not None and _path(reading, film, views) == "film"
         if is_film and not _returns(reading, views):
             raise _two_ways(where, name, "words tell cameras, whose positions continue one path")
+        others = [i for i in places if i not in (*for_cameras, (named or free)[-1])]
+        if is_shared and views is None and any(_tells_film(rows, i) for i in others):
+            readings = "films that are counted anew, of cameras or of one after the other ('part')"
+            raise _two_ways(where, name, readings)
         return reading
     count = "number {} of each name counts frames, the others tell cameras"
     rigs = [of_place(place, places, count.format(n)) for n, place in enumerate(free, 1)]
@@ -483,12 +520,12 @@ def _step(rig: _Reading, views: Sequence[Sequence[float]]) -> float:
     return 0.0 if middle <= _STILL * float(np.ptp(places, axis=0).max()) else middle
 
 
-def _ranked(rows: Sequence[Sequence[str]], places: Sequence[int]) -> list[float]:
+def _ranked(rows: Sequence[Sequence[str]], places: Sequence[int], may_carry: bool = True) -> list[float]:
     """Number names by several numbers, the first of which weighs most; gaps in the last stay.
 
     Where the last number grows all the way, as of frames counted through all chapters, it is the frame's.
-    Where it is carried over, as of minutes and seconds, both are one number. Else a part goes on one step
-    after the one before it.
+    Where it is carried over, as of minutes and seconds, both are one number, if it ``may_carry``. Else a part
+    goes on one step after the one before it.
     """
     keys = [tuple(float(row[i]) for i in places) for row in rows]
     ordered = sorted({*keys})
@@ -496,7 +533,7 @@ def _ranked(rows: Sequence[Sequence[str]], places: Sequence[int]) -> list[float]
     if all(a < b for a, b in zip(last, last[1:])):
         return [key[-1] for key in keys]
     joined, unit = dict(zip(ordered, ordered)), 1.0
-    for place in places[:0:-1]:  # minutes and seconds, seconds and a fraction
+    for place in places[:0:-1] if may_carry else ():  # minutes and seconds, seconds and a fraction
         widths = {len(row[place]) for row in rows}
         bases = [60 * unit, *[10.0**width * unit for width in widths if len(widths) == 1]]
         base = next((base for base in bases if _carries(sorted({*joined.values()}), base)), None)
@@ -586,6 +623,13 @@ def refuse_far(named: Mapping[str, float], where: str, what: str, advice: str) -
         raise mismatch(f"{where}: {what} of {name}", expected, f"{far:.10g}", advice)
 
 
+def _leap(groups: Sequence[set[float]]) -> bool:
+    """Tell whether each camera's numbers are dense, and none goes on where another ends."""
+    ends = sorted((min(group), max(group), len(group)) for group in groups)
+    step = max((high - low) / (count - 1) for low, high, count in ends)
+    return all(low - high > _CARRY * step for (_, high, _), (low, _, _) in zip(ends, ends[1:]))
+
+
 def _check_groups(
     reading: _Reading,
     names: Sequence[str],
@@ -609,7 +653,9 @@ def _check_groups(
     if max(counted) == 1:  # no number twice: one numbering of all, unless cameras film together
         are_long = reading.is_apart and len(groups) > 1 and min(map(len, groups)) > 1
         path = None if views is None or not are_long else _path(reading, reading, views)
-        if are_long and (path == "rig" or (has_word and path is None)):
+        if are_long and path is None and (has_word or (views is None and _leap(groups))):
+            path = "rig" if not any(map(_SPLIT_WORD.search, names)) or has_word else None
+        if path == "rig":
             raise apart(groups[-1], [*dict.fromkeys(reading.cameras)][-1])
         return
     letters = [tuple(re.sub("[^a-z0-9/]", "", part.lower()) for part in camera) for camera in reading.cameras]

@@ -37,7 +37,7 @@ from forewarp.data.depth import (
     confidence_of,
     depths_beside,
     depths_named,
-    doubt_kind,
+    doubt_depths,
 )
 from forewarp.data.directions import check_directions
 from forewarp.data.files import (
@@ -216,7 +216,8 @@ def read_scene(
         parts, how = _split_entries(file, content, entries, test_every, absent)
     if parts["val"] and parts["val"] == parts["test"]:
         assumed.append(f"{file}: val_filenames equals test_filenames: validation is on the test frames")
-    check_times({split: {e.name: given[e.name] for e in part} for split, part in parts.items()}, str(file))
+    of_splits = {split: {e.name: given[e.name] for e in part} for split, part in parts.items()}
+    check_times(of_splits, str(file), {e.name: e.camera for e in entries})
     near, far = number_or_none(near, "data.near"), number_or_none(far, "data.far", 1 / MOST_UNITS)
     near = number_or_none(content.get("near"), f"{file}: near") if near is None else near
     far = number_or_none(content.get("far"), f"{file}: far", 1 / MOST_UNITS) if far is None else far
@@ -261,7 +262,7 @@ def read_scene(
         return Frame(e.name, e.time, camera, e.load, **beside, camera_id=camera_id, moment=e.moment)
 
     train, val, test = (tuple(map(frame, parts[split])) for split in SPLITS)
-    assumed += doubt_kind(train, still, depth_kind, place or file)
+    assumed += doubt_depths(train, space.scale, depth_kind, place or file, "set data.depth_scale={}")
     ranks = {time: n for n, time in enumerate(sorted({*times}))}
     moments = {e.name: ranks[e.time] if e.moment is None else e.moment for e in entries}
     held = held_cameras(test_cameras, views, []), held_moments(test_moments, max(moments.values()) + 1)

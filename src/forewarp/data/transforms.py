@@ -59,6 +59,7 @@ _SAME_FOCAL = 0.02  # share by which two focal lengths of one camera may differ
 _OUTSIDE = 0.9  # share of a side beyond which a principal point is another image's
 _TIMES = ("timestamp", "time_stamp", "frame_time", "time_id", "t", "frame_id", "frame")  # of programs
 _MOST_TIME = 1e20
+_OWN_NUMBERS = 0.5  # share of training's span that frames of an own numbering leave, and of these that tell
 _LEAST_UNIT = 0.5  # of all times, that those in [0, 1] span
 _ROUNDING = 1e-6  # beyond 0 and 1
 
@@ -515,12 +516,16 @@ def _views_of(cameras: Sequence[Camera]) -> list[list[float]]:
     return torch.cat([places, axes * float((places - places[0]).abs().max())], 1).tolist()
 
 
-def check_times(splits: Mapping[str, Mapping[str, float | None]], where: str) -> None:
-    """Refuse times in two units, or a few far from all others: ``times_of`` would squeeze the rest.
+def check_times(
+    splits: Mapping[str, Mapping[str, float | None]], where: str, cameras: Mapping[str, Camera] | None = None
+) -> None:
+    """Refuse times in two units, or a few far from all others: ``times_of`` would squeeze the rest; and those
+    of a split that counts its own images, as cameras on one path tell.
 
     Args:
         splits: of each split the frames' names and what the file says of their times.
         where: the file, for errors.
+        cameras: of the frames, by name.
 
     Raises:
         SceneError: naming a frame, where times are to be scaled to [0, 1] and three or more would span next
@@ -545,6 +550,31 @@ def check_times(splits: Mapping[str, Mapping[str, float | None]], where: str) ->
             expected = f"one unit in all splits, which have {times[0]:.10g} to {times[-1]:.10g}"
             got = f"{min(some):.10g} to {max(some):.10g} ({next(iter(of))}, ..)"
             raise mismatch(f"{where}: times of {split} frames", expected, got, advice)
+        if cameras is not None and split != "train" and _counts_itself(of, splits["train"], cameras):
+            got = f"{min(some):.10g} to {max(some):.10g}, where the camera was at other times of training"
+            expected = f"one numbering of all images, {times[0]:.10g} to {times[-1]:.10g}"
+            raise mismatch(f"{where}: times of {split} frames", expected, got, "count all images together")
+
+
+def _counts_itself(
+    of: Mapping[str, float], train: Mapping[str, float], cameras: Mapping[str, Camera]
+) -> bool:
+    """Tell whether frames of a film are numbered by themselves: one after the other from the first, while
+    training cameras stand where theirs do at quite other times.
+    """
+    times, path = sorted(of.values()), sorted(train, key=train.get)
+    whole = train[path[-1]] - train[path[0]] if path else 0.0
+    is_dense = len(times) > 2 and {b - a for a, b in zip(times, times[1:])} == {1}
+    if not is_dense or times[-1] - times[0] > _OWN_NUMBERS * whole:
+        return False
+    places = torch.stack([cameras[name].center.double() for name in path])
+    step = float((places[1:] - places[:-1]).norm(dim=-1).median())
+    at = torch.tensor([train[name] for name in path], dtype=torch.float64)
+    away = torch.cdist(torch.stack([cameras[name].center.double() for name in of]), places)
+    off = (at - torch.tensor([*of.values()], dtype=torch.float64)[:, None]).abs()
+    is_near = away <= 2 * step
+    elsewhere = is_near.any(1) & ~(is_near & (off <= LEAST_SPAN * whole)).any(1)
+    return step > 0 and float(elsewhere.double().mean()) > _OWN_NUMBERS
 
 
 def _within_unit(times: Iterable[float]) -> bool:
