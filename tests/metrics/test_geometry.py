@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from forewarp.metrics.geometry import chamfer, depth_delta, end_point_error, variation
-from forewarp.metrics.registry import THRESHOLDS
+from forewarp.metrics.limits import THRESHOLDS
 from tests.support import reference
 
 

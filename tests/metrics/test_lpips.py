@@ -7,8 +7,8 @@ import torch
 from torch.nn import functional as F
 
 from forewarp.metrics import lpips
+from forewarp.metrics.limits import NETS
 from forewarp.metrics.lpips import LPIPS, find_lpips, find_lpips_weights
-from forewarp.metrics.registry import NETS
 from tests.support import reference
 
 

@@ -7,8 +7,6 @@ import torch
 from forewarp.ops import gaussians
 from forewarp.ops.gaussians import (
     CHUNK,
-    COLUMN,
-    LEAST_LOG,
     Gaussians,
     Splats,
     Warp,
@@ -18,6 +16,7 @@ from forewarp.ops.gaussians import (
     rasterize,
     rasterize_reference,
 )
+from forewarp.ops.layout import COLUMN, LOG_MIN_ALPHA
 from forewarp.ops.lens import distort
 from tests.support.gaussians import NO_FADES, NO_TINTS, SIZE, crowd, one, pinhole, still, straight
 
@@ -303,7 +302,7 @@ def dense(splats, width, height):
     dx = torch.arange(width) + 0.5 - x
     dy = (torch.arange(height) + 0.5)[:, None] - y
     power = -0.5 * (a * dx * dx + c * dy * dy) - b * dx * dy + solid.log()
-    alpha = torch.where(power > LEAST_LOG, power.exp(), 0.0)
+    alpha = torch.where(power > LOG_MIN_ALPHA, power.exp(), 0.0)
     passed = torch.cumprod(torch.cat([alpha.new_ones(1, height, width), 1 - alpha]), 0)
     shown = torch.einsum("vhw,vk->khw", alpha * passed[:-1], values[:, COLUMN.red :])
     return torch.cat([shown, passed[-1:]])

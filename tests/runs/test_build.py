@@ -10,6 +10,7 @@ from omegaconf import OmegaConf
 from forewarp.cli.train import beginning
 from forewarp.runs import build
 from forewarp.runs.config import content_hash, plain
+from forewarp.runs.devices import device_for, why_on_cpu
 from tests.support.configs import composed
 
 
@@ -53,9 +54,9 @@ PARTICLES, NERF = "forewarp.methods.particles.model.Particles", "forewarp.method
 def test_auto_takes_what_the_methods_belong_on(machine, accelerator, targets, cuda, device):
     machine(cuda=cuda, apple=True)
     config = on(accelerator, *targets)
-    assert build.device_for(config) == torch.device(device)
+    assert device_for(config) == torch.device(device)
     is_left_aside = cuda and accelerator == "auto" and PARTICLES in targets
-    assert (build.why_on_cpu(config) is not None) == is_left_aside
+    assert (why_on_cpu(config) is not None) == is_left_aside
 
 
 @pytest.mark.parametrize(
@@ -65,7 +66,7 @@ def test_auto_takes_what_the_methods_belong_on(machine, accelerator, targets, cu
 def test_a_device_that_is_not_there_is_refused(machine, accelerator, text):
     machine(apple=True)
     with pytest.raises(ValueError, match=text):
-        build.device_for(on(accelerator))
+        device_for(on(accelerator))
 
 
 def test_training_and_evaluation_use_the_same_device(machine, tmp_path):

@@ -257,7 +257,7 @@ def _of_hydra(said: str) -> str | None:
     group, word = absent.groups()
     if group.partition("/")[0] == "trainer":
         word = f"{group}/{word}".partition("/")[2]
-        from forewarp.runs.config import instead_of
+        from forewarp.runs.devices import instead_of
 
         return f"trainer: expected auto, cpu or gpu, but got {word}; {instead_of(word)}"
     from forewarp.runs.sections import option_groups

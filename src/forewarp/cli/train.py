@@ -185,7 +185,7 @@ def beginning(run, config) -> str:
     """Say in two lines what is about to be trained, on what device, and into which folder; in one more why
     a GPU is left aside, if it is.
     """
-    from forewarp.runs.build import why_on_cpu
+    from forewarp.runs.devices import why_on_cpu
 
     scene, why = run.datamodule.scene, why_on_cpu(config)
     images = f"{images_of(scene.train, 'training')} and {images_of(scene.test, 'test')}"

@@ -20,7 +20,7 @@ from forewarp.glb import meshopt
 from forewarp.glb.container import CAMERA_AXES, CHUNKS, COMPONENTS, COMPRESSION, ELEMENTS, MAGIC, VERSION
 from forewarp.glb.writer import FORMAT, MOTION, QUATERNIONS, SPLATS, WINDOWS, Setting
 from forewarp.ops.backend import is_number
-from forewarp.ops.gaussians import LEAST_LOG
+from forewarp.ops.layout import LOG_MIN_ALPHA
 from forewarp.scene.camera import Camera, Lens
 
 _EXTENSIONS = COMPRESSION, SPLATS, MOTION  # that a file may require
@@ -359,7 +359,7 @@ def _gaussians(container: Container, attributes: Fields, motion: Fields) -> Movi
         opacities = opacities[..., 0]
         logits = _floats(container.array(motion, "opacityLogits", "SCALAR", count))[:, 0]
     canonical_time = motion.number("canonicalTime", 0, 1)
-    motion.fixed("cutoff", math.exp(LEAST_LOG))
+    motion.fixed("cutoff", math.exp(LOG_MIN_ALPHA))
     motion.fixed("margin", MARGIN)
     return MovingGaussians(
         means, scales.log(), quaternions.roll(1, -1), logits, torch.stack(harmonics, 1), colors, opacities,

@@ -16,7 +16,7 @@ from forewarp.fields.moving import MARGIN, MovingGaussians, NodeMotion
 from forewarp.fields.windows import Window, longest_fade
 from forewarp.glb import meshopt
 from forewarp.glb.container import BYTE, CAMERA_AXES, SHORT, SIGNED_SHORT, UNIT_BYTE, Buffer, quaternion_of
-from forewarp.ops.gaussians import LEAST_LOG
+from forewarp.ops.layout import LOG_MIN_ALPHA
 from forewarp.scene.camera import Camera
 
 SPLATS, MOTION = "KHR_gaussian_splatting", "FOREWARP_gaussian_motion"
@@ -60,7 +60,7 @@ def write(windows: Sequence[tuple[Window, Rows]], setting: Setting, quality: str
     primitives = [_primitive(store, setting.cameras, window.gaussians, rows) for window, rows in windows]
     motion = primitives[0]["extensions"][SPLATS]["extensions"][MOTION]
     motion |= {"seconds": setting.seconds, "background": list(setting.background)}
-    motion |= {"focus": setting.focus.tolist(), "cutoff": math.exp(LEAST_LOG), "margin": MARGIN}
+    motion |= {"focus": setting.focus.tolist(), "cutoff": math.exp(LOG_MIN_ALPHA), "margin": MARGIN}
     if len(windows) > 1:
         begins, spans = zip(*((window.begin, window.span) for window, _ in windows))
         about = [{"span": list(span), "from": begin} for begin, span in zip(begins, spans)]
@@ -143,7 +143,7 @@ def rows_in_file(
     if gaussians.opacity_over_time is not None:
         bases = torch.stack([gaussians.bases(i / _TIMES)[1] for i in range(_TIMES + 1)])
         logits = (logits + bases @ gaussians.opacity_over_time.T).amax(0)
-    seen = torch.nn.functional.logsigmoid(logits) > LEAST_LOG
+    seen = torch.nn.functional.logsigmoid(logits) > LOG_MIN_ALPHA
     seen = (seen if shown is None else seen & shown).numpy()
     rests = np.ones(len(seen), bool)
     if gaussians.motion is not None:

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from forewarp.metrics.registry import THRESHOLDS
+from forewarp.metrics.limits import THRESHOLDS
 from forewarp.ops.backend import check_shapes
 
 MOVING_FRACTION = 0.02

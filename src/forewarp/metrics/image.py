@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from forewarp.metrics.registry import MS_SSIM_LEAST_SIDE, SSIM_LEAST_SIDE
+from forewarp.metrics.limits import MS_SSIM_LEAST_SIDE, SSIM_LEAST_SIDE
 from forewarp.ops.backend import check_shapes
 
 PSNR_CAP = 100.0

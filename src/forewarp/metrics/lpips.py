@@ -18,7 +18,7 @@ from torch.nn import functional as F
 
 from forewarp.archives import read_archive
 from forewarp.metrics.image import image_pair
-from forewarp.metrics.registry import LPIPS_LEAST_SIDE, NETS
+from forewarp.metrics.limits import LPIPS_LEAST_SIDE, NETS
 
 WEIGHTS_VARIABLE = "FOREWARP_LPIPS_WEIGHTS"
 _FILE_PATTERNS = {

@@ -9,16 +9,15 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from forewarp.metrics.limits import LPIPS_LEAST_SIDE, MS_SSIM_LEAST_SIDE, NETS, SSIM_LEAST_SIDE, THRESHOLDS
+
 if TYPE_CHECKING:  # so that reports and refusals wait for no torch
     from torch import Tensor
 
     from forewarp.metrics.lpips import LPIPS
     from forewarp.scene.view import Target
 
-SSIM_LEAST_SIDE, MS_SSIM_LEAST_SIDE, LPIPS_LEAST_SIDE = 11, 161, 32  # pixels
-NETS = "squeeze", "vgg", "alex"  # backbones of LPIPS
 LPIPS_METRICS = tuple(f"lpips_{net}" for net in NETS)
-THRESHOLDS = (1.02, 1.25, 1.25**2)  # ratios of rendered and true depth
 ABILITIES = ("space", "time", "space_time", "canonical", "all")
 PARTS = ("moving", "still")  # of images whose masks say what moves
 

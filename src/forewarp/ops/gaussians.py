@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections import namedtuple
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import accumulate
@@ -17,6 +16,7 @@ from torch.nn.functional import pad
 from torch.utils.checkpoint import checkpoint
 
 from forewarp.ops.backend import arrays, check_shapes, match_threads, use_numba
+from forewarp.ops.layout import COLUMN, LOG_MIN_ALPHA, MAX_PER_TILE, SPLAT_WIDTH, TILE_SIZE
 from forewarp.ops.lens import distort_with_jacobian
 
 BLUR = 0.1  # square pixels; a pixel alone has a variance of 1/12
@@ -24,15 +24,8 @@ BLUR = 0.1  # square pixels; a pixel alone has a variance of 1/12
 CHUNK = 1 << 22
 FLAT = 0.28209479177387814  # the first harmonic, 1 / sqrt(4 pi), which no direction changes
 DEEP = 0.03  # relative error of depth at which its loss turns from a square to a line
-LEAST_LOG = -math.log(255.0)  # of an alpha: less than a 255th is not seen
-MOST = 1 << 15  # splats of a tile that count, the nearest ones
-SIDE = 8  # pixels of a tile along both axes
-WIDE = 16  # the same of the reference
-SPLAT = 16  # numbers of a splat as kernels read it: its columns, then zeros
+WIDE = 16  # pixels of a tile of the reference along both axes
 _LEAST = 1e-12  # length of a quaternion below which it rotates nothing
-# Where the numbers of a splat lie; ``Splats.values`` has those up to the depth.
-_NAMES = "x y conic_a conic_b conic_c opacity red green blue depth reach_x reach_y log_opacity"
-COLUMN = namedtuple("Columns", _NAMES)(*range(13))
 
 
 @dataclass(frozen=True)
@@ -250,7 +243,7 @@ def _projected(*tensors: Tensor) -> tuple[tuple[Tensor, ...], Tensor]:
     from forewarp.ops.kernels import project as kernels
 
     inputs = (*tensors[:5], pad(tensors[5], (0, 4)), *tensors[6:])
-    splats = tensors[0].new_empty(_whole(len(tensors[0])), SPLAT)
+    splats = tensors[0].new_empty(_whole(len(tensors[0])), SPLAT_WIDTH)
     kernels.project(*arrays(*inputs, splats))
     return inputs, splats
 
@@ -272,7 +265,7 @@ class _Project(torch.autograd.Function):
         threads = match_threads()
         *inputs, splats = ctx.saved_tensors
         seen = (splats[:, COLUMN.reach_x] > 0).nonzero()[:, 0]
-        rows = by_values.new_zeros(_whole(len(seen)), SPLAT)
+        rows = by_values.new_zeros(_whole(len(seen)), SPLAT_WIDTH)
         rows[: len(seen), : by_values.shape[1]] = by_values[seen]
         kinds, seen = [inputs[4].shape[1]], seen.int().numpy()
         gradients, colors, maps, weights = _chain(inputs, splats, seen, rows, threads, kinds)
@@ -414,7 +407,7 @@ def _blend(values: Tensor, rows: Tensor, tiles: Tensor) -> Tensor:
     dx, dy = centers[:, None, None, :, 0] - x, centers[:, None, :, None, 1] - y
     power = -0.5 * (a * dx * dx + c * dy * dy) - b * dx * dy + solid.log()
     inside = (place < length)[..., None, None]
-    alpha = torch.where(inside & (power > LEAST_LOG), power.exp(), 0.0)
+    alpha = torch.where(inside & (power > LOG_MIN_ALPHA), power.exp(), 0.0)
     passed = torch.cumprod(torch.cat([alpha.new_ones(len(tiles), 1, WIDE, WIDE), 1 - alpha], 1), 1)
     shown = torch.einsum("glhw,glk->gkhw", alpha * passed[:, :-1], own[..., COLUMN.red :])
     return torch.cat([shown, passed[:, -1:]], 1)
@@ -448,12 +441,14 @@ def _sorted_tiles(splats: np.ndarray, width: int, height: int, threads: int) -> 
 
 def _tiles(width: int, height: int) -> tuple[int, int]:
     """Return how many tiles an image has across and down."""
-    return -(-width // SIDE), -(-height // SIDE)
+    return -(-width // TILE_SIZE), -(-height // TILE_SIZE)
 
 
 def _kept_for(tiles: _Tiles) -> Tensor:
     """Make room for what each thread keeps of a tile between the forward and the backward pass."""
-    return torch.empty(len(tiles.lists[3]) - 1, 2 * max(min(tiles.longest, MOST), 1), SIDE * SIDE)
+    return torch.empty(
+        len(tiles.lists[3]) - 1, 2 * max(min(tiles.longest, MAX_PER_TILE), 1), TILE_SIZE * TILE_SIZE
+    )
 
 
 class _Rasterize(torch.autograd.Function):
@@ -463,9 +458,9 @@ class _Rasterize(torch.autograd.Function):
 
         threads, (across, down) = match_threads(), _tiles(width, height)
         log_opacity = values.detach()[:, COLUMN.opacity, None].log()
-        splats = pad(torch.cat([values.detach(), reach, log_opacity], -1), (0, SPLAT - len(COLUMN)))
+        splats = pad(torch.cat([values.detach(), reach, log_opacity], -1), (0, SPLAT_WIDTH - len(COLUMN)))
         tiles = _sorted_tiles(splats.numpy(), width, height, threads)
-        out = torch.empty(5, SIDE * down, SIDE * across)
+        out = torch.empty(5, TILE_SIZE * down, TILE_SIZE * across)
         kernels.draw(*tiles.lists, out.numpy())
         ctx.tiles, ctx.splats = tiles, splats
         return out
@@ -478,7 +473,7 @@ class _Rasterize(torch.autograd.Function):
         match_threads()
         tiles, splats = ctx.tiles, ctx.splats
         kept = _kept_for(tiles)
-        sums = torch.empty(len(kept), len(tiles.order), SPLAT)
+        sums = torch.empty(len(kept), len(tiles.order), SPLAT_WIDTH)
         kernels.pull(*tiles.lists, *arrays(by_planes, kept, sums))
         seen, by_splat, _ = _splat_gradients(splats, tiles, sums, 1.0)
         by_values = by_planes.new_zeros(len(splats), COLUMN.depth + 1)
@@ -496,7 +491,7 @@ def _splat_gradients(splats: Tensor, tiles: _Tiles, sums: Tensor, factor: float)
     ranks = np.full(len(splats), -1, np.int32)
     ranks[tiles.order] = np.arange(len(tiles.order))
     seen = np.flatnonzero(ranks >= 0).astype(np.int32)
-    by_splat, pixel_gradient = torch.empty(_whole(len(seen)), SPLAT), torch.zeros(len(splats))
+    by_splat, pixel_gradient = torch.empty(_whole(len(seen)), SPLAT_WIDTH), torch.zeros(len(splats))
     inputs = (*arrays(splats), seen, ranks[seen], *arrays(sums), factor)
     kernels.splat_gradients(*inputs, *arrays(by_splat, pixel_gradient))
     return seen, by_splat, pixel_gradient
@@ -655,7 +650,7 @@ def compile_backward_kernels(
     """Compile the backward kernels on empty tiles."""
     maps, camera, (width, height) = pad(warp.maps, (0, 4)), pinhole.row(particles.means), pinhole.size
     inputs = (*particles, maps, warp.links, warp.weights, camera, color_basis, opacity_basis)
-    splats, count = torch.zeros(_whole(len(particles.means)), SPLAT), math.prod(_tiles(width, height))
+    splats, count = torch.zeros(_whole(len(particles.means)), SPLAT_WIDTH), math.prod(_tiles(width, height))
     none, records = np.zeros(0, np.int32), np.zeros((0, COLUMN.depth + 1), np.float32)
     tiles = _Tiles(none, (records, none, np.zeros(count + 1, np.int64), np.array([0, count])), 0)
     image = torch.zeros(height, width, dtype=torch.int32)
@@ -671,9 +666,9 @@ def _compare_sorted(
     from forewarp.ops.kernels import rasterize as kernels
 
     kept, (count, coefficients) = _kept_for(tiles), inputs[4].shape[:2]
-    sums = torch.empty(len(kept), len(tiles.order), SPLAT)
+    sums = torch.empty(len(kept), len(tiles.order), SPLAT_WIDTH)
     scores = torch.zeros(len(kept), 3, dtype=torch.float64)
-    (high, wide), edge = image.shape, (0, -image.shape[1] % SIDE, 0, -image.shape[0] % SIDE)
+    (high, wide), edge = image.shape, (0, -image.shape[1] % TILE_SIZE, 0, -image.shape[0] % TILE_SIZE)
     image, planes = (part if part is None or not any(edge) else pad(part, edge) for part in (image, planes))
     truth = image.numpy().view("uint32"), wide, high, *arrays(background.float()), np.float32(width)
     beside = None if planes is None else planes.numpy()

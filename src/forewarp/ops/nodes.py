@@ -6,8 +6,8 @@ import torch
 from torch import Tensor
 
 from forewarp.ops.backend import arrays, check_shapes, match_threads, use_numba
+from forewarp.ops.layout import EPSILON
 
-LEAST = 1e-20  # the sum of a particle's weights is divided by this at least: that of one at rest is 0
 _WIDEST = 16  # nodes of a particle that the kernel knows
 _EDGES = "motion (M, 6), places (M, 3), edges (M, E), weights (M, E)"
 _PULLED = f"{_EDGES}, by_maps (M, 12)"
@@ -53,7 +53,7 @@ def node_maps(motion: Tensor, places: Tensor) -> Tensor:
     across = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).reshape(-1, 3, 3)
     eye = torch.eye(3).to(motion)
     linear = gibbs[:, :, None] * gibbs[:, None] - square[:, None, None] * eye + scalar * across
-    linear = linear * (2 / (scalar.square() + square[:, None, None]).clamp(min=LEAST))
+    linear = linear * (2 / (scalar.square() + square[:, None, None]).clamp(min=EPSILON))
     rest = shift - (linear @ places[..., None])[..., 0]
     return torch.cat([linear.reshape(-1, 9), rest], -1)
 
@@ -218,7 +218,7 @@ def skin_weights(shares: Tensor, learned: Tensor) -> Tensor:
     if not fast or asks or not 0 < shares.shape[1] <= _WIDEST:
         top = learned.detach().amax(-1, keepdim=True)  # a row less it means the same, and is safe
         weights = shares * (learned - top).exp()
-        return weights / weights.sum(-1, keepdim=True).clamp(min=LEAST)
+        return weights / weights.sum(-1, keepdim=True).clamp(min=EPSILON)
     from forewarp.ops.kernels import nodes as kernels
 
     match_threads()

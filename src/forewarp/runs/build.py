@@ -12,8 +12,7 @@ from pathlib import Path
 
 import torch
 from hydra.core.hydra_config import HydraConfig
-from hydra.errors import HydraException
-from hydra.utils import get_object, instantiate
+from hydra.utils import instantiate
 from lightning.pytorch.profilers import AdvancedProfiler, SimpleProfiler
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from omegaconf import DictConfig, OmegaConf
@@ -26,13 +25,13 @@ from forewarp.provenance import RESULTS
 from forewarp.runs.config import (
     IDENTITY,
     IDENTITY_IF_SET,
-    instead_of,
     is_swept,
     plain,
     saved_config,
     set_value,
     trust_of,
 )
+from forewarp.runs.devices import device_for
 from forewarp.runs.overrides import constant, key_of, typed_overrides
 from forewarp.scene.cloud import Handover
 from forewarp.training.callbacks import StageProgress
@@ -339,37 +338,3 @@ def check_trainer(trainer: DictConfig) -> None:
         got += "" if trainer.get("strategy", "auto") == "auto" else f" with strategy={trainer.strategy}"
         advice = "one process trains a run, --multirun launcher=joblib trains several at once"
         raise mismatch("trainer.devices", "1, or the number of one GPU as [0]", got, advice)
-
-
-def device_for(config: DictConfig) -> torch.device:
-    """Return the device of a run: with ``trainer=auto`` a CUDA GPU, unless there is none or ``why_on_cpu``.
-
-    Other accelerators (Apple's, for example) lack float64, which cameras and the cosine basis need.
-
-    Raises:
-        ValueError: for another accelerator, or for a GPU where there is none.
-    """
-    accelerator = config.trainer.accelerator
-    if accelerator not in ("auto", "cpu", "gpu", "cuda"):
-        raise mismatch("trainer.accelerator", "auto, cpu, gpu or cuda", accelerator, instead_of(accelerator))
-    if accelerator in ("gpu", "cuda") and not torch.cuda.is_available():
-        raise ValueError("trainer.accelerator: expected a GPU, but found none; use trainer=cpu")
-    if accelerator == "auto":
-        accelerator = "cuda" if torch.cuda.is_available() and why_on_cpu(config) is None else "cpu"
-    return torch.device("cpu" if accelerator == "cpu" else "cuda")
-
-
-def why_on_cpu(config: DictConfig) -> str | None:
-    """Say in a line why ``trainer=auto`` leaves a GPU aside; None where it does not, or there is none."""
-    if config.trainer.accelerator != "auto" or not torch.cuda.is_available():
-        return None
-    for stage in config.stage.values():
-        model = None if stage is None else OmegaConf.select(stage, "model", default=None) or config.model
-        if not isinstance(model, DictConfig):
-            continue
-        with suppress(HydraException, ImportError, ValueError):  # building the method names such a mistake
-            why = getattr(get_object(str(model.get("_target_"))), "on_cpu", None)
-            if why is not None:
-                name = model.get("name", config.model.get("name"))
-                return f"model={name} leaves the GPU aside: {why}; trainer=gpu runs it there all the same"
-    return None

@@ -27,6 +27,7 @@ from omegaconf.errors import OmegaConfBaseException
 from forewarp.data.files import RECORD, mismatch, number, one_of
 from forewarp.files import MOST_CONFIG, check_command, check_yaml, read_text, refuse_links
 from forewarp.outline import check_outline
+from forewarp.runs.devices import device_for
 from forewarp.runs.overrides import constant, key_of, typed_overrides
 
 # Two runs differ if these keys differ; device, folder and what is shown do not count.
@@ -59,10 +60,6 @@ HOMES = {
     "trainer": ("lightning.Trainer", "lightning.pytorch.Trainer"),
     "logger": ("lightning.pytorch.loggers.", "forewarp.training.loggers.CsvLogger"),
 }
-# What other templates have as trainers: why there is none here, and what to type.
-_ONE_PROCESS = "one process trains a run: use trainer=gpu, and --multirun launcher=joblib for several at once"
-_NO_TRAINERS = dict.fromkeys(("ddp", "ddp_spawn", "ddp_sim", "fsdp", "deepspeed"), _ONE_PROCESS)
-_NO_TRAINERS["mps"] = "Apple's GPUs have no float64, which cameras and the cosine basis need: use trainer=cpu"
 _RESERVED = {"_target_", "_partial_", "_recursive_", "_convert_"}
 # What OmegaConf and PyYAML raise for a text that is no config.
 _UNREADABLE = yaml.YAMLError, OmegaConfBaseException, ValueError, TypeError
@@ -115,11 +112,6 @@ def is_swept() -> bool:
     return HydraConfig.initialized() and HydraConfig.get().mode == RunMode.MULTIRUN
 
 
-def instead_of(trainer: str) -> str:
-    """Say what to type in place of a trainer or accelerator that there is not, and why where it is known."""
-    return _NO_TRAINERS.get(trainer, "use trainer=auto")
-
-
 def in_words(overrides: Sequence[str]) -> str:
     """Name a job of a sweep by its overrides, but for what its folder's name says by itself.
 
@@ -149,8 +141,6 @@ def content_hash(config: DictConfig, more: Sequence[str] = (), *others: object) 
         content["data"] = {key: value for key, value in data.items() if key not in {*NOT_OF_RUN, *absent}}
     precision = config.trainer.get("precision")
     if config.budget.minutes is not None:
-        from forewarp.runs.build import device_for  # loads torch
-
         content["on"] = [device_for(config).type, precision, config.get("threads")]
     elif precision not in (None, "32-true"):
         content["precision"] = precision

@@ -209,7 +209,7 @@ def likeness(config: DictConfig) -> Row:
     import torch
 
     from forewarp.evaluation.evaluate import device_name
-    from forewarp.runs.build import device_for
+    from forewarp.runs.devices import device_for
 
     parts = {key: plain(config.get(key)) for key in ("model", "objective", "stage", "preset")}
     digest = sha256(json.dumps(parts, sort_keys=True, default=str).encode()).hexdigest()[:10]

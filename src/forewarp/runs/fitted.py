@@ -27,8 +27,9 @@ from forewarp.fields.windows import MovingWindows
 from forewarp.files import read_json, write_json
 from forewarp.glb.reader import read
 from forewarp.methods.method import HasMatter, HasTrajectories, Method
+from forewarp.metrics.limits import NETS
 from forewarp.metrics.lpips import find_lpips, find_lpips_weights
-from forewarp.metrics.registry import METRICS, NETS, ImageSuite
+from forewarp.metrics.registry import METRICS, ImageSuite
 from forewarp.ops.backend import is_number
 from forewarp.progress import Counted
 from forewarp.runs.build import build_run

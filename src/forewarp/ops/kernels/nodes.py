@@ -19,9 +19,9 @@ from forewarp.ops.kernels.lanes import (
     sixteen,
     transpose,
 )
-from forewarp.ops.nodes import LEAST
+from forewarp.ops.layout import EPSILON
 
-_LEAST = np.float32(LEAST)
+_EPSILON = np.float32(EPSILON)
 
 
 @njit(inline="always")
@@ -30,7 +30,7 @@ def _linear(motion, m, out):
     x, y, z = motion[m, 3], motion[m, 4], motion[m, 5]
     a = 1.0 + motion[m, 6] if motion.shape[1] > 6 else 1.0
     square = x * x + y * y + z * z
-    s = 2.0 / max(a * a + square, _LEAST)
+    s = 2.0 / max(a * a + square, _EPSILON)
     out[0], out[1], out[2] = s * (x * x - square), s * (x * y - a * z), s * (x * z + a * y)
     out[3], out[4], out[5] = s * (x * y + a * z), s * (y * y - square), s * (y * z - a * x)
     out[6], out[7], out[8] = s * (x * z - a * y), s * (y * z + a * x), s * (z * z - square)
@@ -145,7 +145,7 @@ def weigh(shares, learned, weights, width):
                 part = row_of(parts, j) * exp(row_of(numbers, j) - top)
                 set_row(parts, j, part)
                 total = total + part
-            inverse = sixteen(1.0) / maximum(_LEAST, total)  # NaN stays NaN
+            inverse = sixteen(1.0) / maximum(_EPSILON, total)  # NaN stays NaN
             for j in range(width):
                 set_row(parts, j, row_of(parts, j) * inverse)
             transpose(parts)
@@ -165,4 +165,4 @@ def weigh(shares, learned, weights, width):
             weights[at + j] = shares[at + j] * np.float32(math.exp(learned[at + j] - top))
             total += weights[at + j]
         for j in range(width):
-            weights[at + j] /= max(total, _LEAST)
+            weights[at + j] /= max(total, _EPSILON)

@@ -9,7 +9,6 @@ from __future__ import annotations
 import numpy as np
 from numba import njit, prange
 
-from forewarp.ops.gaussians import COLUMN, LEAST_LOG, SPLAT
 from forewarp.ops.kernels.keeping import KEPT
 from forewarp.ops.kernels.lanes import (
     NARROW,
@@ -30,6 +29,7 @@ from forewarp.ops.kernels.lanes import (
     transpose,
     where_above,
 )
+from forewarp.ops.layout import COLUMN, LOG_MIN_ALPHA, SPLAT_WIDTH
 
 SIDE_BY_SIDE = NARROW
 # Where the numbers of a camera lie, after its rotation; see ``Pinhole.row``.
@@ -39,7 +39,7 @@ CENTER, FOCAL, SKEW, MIDDLE, SIZE, NEAR, BLUR, MARGIN, RADIAL, TANGENTIAL, REACH
 # Rows of a room: the blended map, then what is gathered of the Gaussians, then harmonics.
 MEAN, SCALE, QUATERNION, ANY, BASIS, ROWS = 16, 19, 22, 26, 29, 45
 # On the way back the gradients by a splat's columns follow.
-GRADIENT, ROWS_BACK = ROWS, ROWS + SPLAT
+GRADIENT, ROWS_BACK = ROWS, ROWS + SPLAT_WIDTH
 C0, C1 = np.float32(0.28209479177387814), np.float32(0.4886025119029199)
 C20, C21, C22 = (np.float32(c) for c in (1.0925484305920792, 0.31539156525252005, 0.5462742152960396))
 C30, C31, C32 = (np.float32(c) for c in (0.5900435899266435, 2.890611442640554, 0.4570457994644658))
@@ -234,7 +234,7 @@ def _colors(direction, colors, color_basis, which, place):
 def _squared_reach(camera, ahead, beside, lens, determinant, opacity, log_opacity):
     """Twice the logarithm of 255 times the opacity, 0 of what is not seen."""
     zero = np.float32(0)
-    reach = where_above(opacity, np.float32(1 / 255), (log_opacity - np.float32(LEAST_LOG)) * 2.0)
+    reach = where_above(opacity, np.float32(1 / 255), (log_opacity - np.float32(LOG_MIN_ALPHA)) * 2.0)
     reach = where_above(ahead, camera[NEAR], reach)
     reach = where_above(camera[REACH] - beside, zero, reach)
     for pixel, size in ((lens[0], camera[SIZE]), (lens[1], camera[SIZE + 1])):
@@ -503,7 +503,7 @@ def chain(
                 which[lane] = seen[min(start + lane, count - 1)]
                 set_row(place, lane, get_row(gradients, start + lane))
             transpose(place)
-            set_rows(place, GRADIENT, rows_of(place, 0, SPLAT))
+            set_rows(place, GRADIENT, rows_of(place, 0, SPLAT_WIDTH))
             x, y, z = warp_points(means, maps, links, weights, which, place)
             local, depth, direction = to_camera(camera, x, y, z)
             inverse = sixteen(1.0) / local[2]

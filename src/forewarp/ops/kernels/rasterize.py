@@ -11,7 +11,6 @@ from __future__ import annotations
 import numpy as np
 from numba import njit, prange
 
-from forewarp.ops.gaussians import COLUMN, LEAST_LOG, MOST, SIDE
 from forewarp.ops.kernels.keeping import KEPT
 from forewarp.ops.kernels.lanes import (
     add_sums,
@@ -43,10 +42,11 @@ from forewarp.ops.kernels.lanes import (
     widened,
 )
 from forewarp.ops.kernels.project import SIDE_BY_SIDE
+from forewarp.ops.layout import COLUMN, LOG_MIN_ALPHA, MAX_PER_TILE, TILE_SIZE
 
 RECORD = COLUMN.depth + 1  # numbers of a record
 _OVER = 1e-3  # transmittance below which nothing behind is seen
-_ZERO, _SHARE = np.float32(0), np.float32(1 / SIDE)
+_ZERO, _SHARE = np.float32(0), np.float32(1 / TILE_SIZE)
 _HALF = np.float32(0.5)  # a tile's first pixel's centre
 _SLACK = np.float32(1e-3)  # pixels that rounding may move an edge by
 
@@ -76,7 +76,7 @@ def _write_records(splats, order, start, end, across, down, records, spans, outl
     put_row(outline, 2, half)
     put_row(outline, 3, b * half)
     put_row(outline, 4, b * b - a * c * 4.0)
-    put_row(outline, 5, a * 4.0 * (np.float32(LEAST_LOG) - log_opacity))
+    put_row(outline, 5, a * 4.0 * (np.float32(LOG_MIN_ALPHA) - log_opacity))
     put_row(outline, 6, b / c * wide * -0.5)
     set_rows(place, COLUMN.conic_a, (a, b, c, log_opacity))
     first, last = _span(x - wide, x + wide, across)
@@ -97,9 +97,9 @@ def _write_records(splats, order, start, end, across, down, records, spans, outl
 @njit(forceinline=True)
 def _span(low, high, count):
     """The first tile with a pixel's centre in an interval, and the one after the last, to be rounded down."""
-    low, high = low + (_HALF - _SLACK), high + (np.float32(SIDE) - _HALF + _SLACK)
-    low = minimum(maximum(low, _ZERO), np.float32(SIDE * (count + 1)))
-    high = minimum(maximum(high, _ZERO), np.float32(SIDE * count))
+    low, high = low + (_HALF - _SLACK), high + (np.float32(TILE_SIZE) - _HALF + _SLACK)
+    low = minimum(maximum(low, _ZERO), np.float32(TILE_SIZE * (count + 1)))
+    high = minimum(maximum(high, _ZERO), np.float32(TILE_SIZE * count))
     return low * _SHARE, high * _SHARE
 
 
@@ -116,8 +116,8 @@ def _spans_by_row(outline, spans, start, end, across, most, lows, highs):
     bend, rest, tip = get_row(outline, 4), get_row(outline, 5), get_row(outline, 6)
     first = row_of(tops, 0)
     for row in range(most):
-        top = (first + row) * SIDE + _HALF - y
-        bottom = top + (SIDE - 1)
+        top = (first + row) * TILE_SIZE + _HALF - y
+        bottom = top + (TILE_SIZE - 1)
         at, to = minimum(maximum(tip * -1.0, top), bottom), minimum(maximum(tip, top), bottom)
         left = x + (slope * at - half * root(maximum(bend * at * at + rest, _ZERO)))
         right = x + (slope * to + half * root(maximum(bend * to * to + rest, _ZERO)))
@@ -204,7 +204,7 @@ def _alpha(records, i, column, y):
     along = widened(fma(dx * dx, records[i, COLUMN.conic_a], sixteen(records[i, COLUMN.opacity])))
     across = widened(dx * records[i, COLUMN.conic_b])
     power = fma(dy, fma(dy, records[i, COLUMN.conic_c], across), along)
-    return where_above(power, np.float32(LEAST_LOG), exp_down(power))
+    return where_above(power, np.float32(LOG_MIN_ALPHA), exp_down(power))
 
 
 @njit(cache=KEPT)
@@ -217,7 +217,7 @@ def _blend(records, entries, first, last, column, y, kept, deep):
     """
     through, red, green, blue, far = lanes(1.0), lanes(0.0), lanes(0.0), lanes(0.0), lanes(0.0)
     count = 0
-    for at in range(first, min(last, first + MOST)):
+    for at in range(first, min(last, first + MAX_PER_TILE)):
         i = entries[at]
         alpha = _alpha(records, i, column, y)
         weight = alpha * through
@@ -273,10 +273,10 @@ def draw(records, entries, ends, shares, out):
 
     ``shares`` (S + 1): thread s draws the tiles from ``shares[s]`` on.
     """
-    across = out.shape[2] // SIDE
+    across = out.shape[2] // TILE_SIZE
     for share in prange(len(shares) - 1):
         for tile in range(shares[share], shares[share + 1]):
-            row, column = SIDE * (tile // across), SIDE * (tile % across)
+            row, column = TILE_SIZE * (tile // across), TILE_SIZE * (tile % across)
             first, last, left, y = ends[tile], ends[tile + 1], np.float32(column), rows() + row
             through, red, green, blue, far, _ = _blend(records, entries, first, last, left, y, None, True)
             put_tile(out[0], row, column, red)
@@ -291,7 +291,7 @@ def pull(records, entries, ends, shares, gradients, kept, sums):
     """Gradients of ``draw``: ``gradients`` (5, H', W') by its five planes, into ``sums`` (S, V, 16); whatever
     was there before is gone.
     """
-    across = gradients.shape[2] // SIDE
+    across = gradients.shape[2] // TILE_SIZE
     for share in prange(len(shares) - 1):
         own, added = kept[share], sums[share]
         added[:] = 0
@@ -299,7 +299,7 @@ def pull(records, entries, ends, shares, gradients, kept, sums):
             first, last = ends[tile], ends[tile + 1]
             if first == last:
                 continue
-            row, column = SIDE * (tile // across), SIDE * (tile % across)
+            row, column = TILE_SIZE * (tile // across), TILE_SIZE * (tile % across)
             left, y = np.float32(column), rows() + row
             count = _blend(records, entries, first, last, left, y, own, None)[5]
             # The last plane is what is let through: its gradient stands behind everything, times 1.
@@ -351,12 +351,12 @@ def compare(
     width. Into ``scores`` (S, 3) go loss, squared error and the loss of depth, into ``sums`` (S, V, 16) the
     gradients; what was there before is gone.
     """
-    across = pixels.shape[1] // SIDE
+    across = pixels.shape[1] // TILE_SIZE
     for share in prange(len(shares) - 1):
         score, own, added = np.zeros(3, np.float64), kept[share], sums[share]
         added[:] = 0
         for tile in range(shares[share], shares[share + 1]):
-            row, column = SIDE * (tile // across), SIDE * (tile % across)
+            row, column = TILE_SIZE * (tile // across), TILE_SIZE * (tile % across)
             first, last, left, y = ends[tile], ends[tile + 1], np.float32(column), rows() + row
             through, red, green, blue, far, count = _blend(
                 records, entries, first, last, left, y, own, planes
