@@ -63,9 +63,9 @@ test-floors: ## run the same tests with the lowest versions that pyproject.toml 
 	$(FLOORS)/bin/pytest --no-cov -W default -m "not slow" # they warn of what came later
 fuzz: ## read 5,000 harmed files of every format, the same each time: none may take 10 s, a gigabyte, or a traceback
 	OMP_NUM_THREADS=1 $(BIN)/pytest --no-cov -q -s tests/stability/test_fuzzing.py --hypothesis-profile=fuzz
-conformance: ## test every method against the contract, slow cases too, and write docs/conformance.md
-	OMP_NUM_THREADS=1 $(BIN)/pytest --no-cov -q tests/contract/test_contract.py --conformance=docs/conformance.md
-bench: ## time every operator, a step and a frame, into docs/performance.md (a quarter of an hour)
+conformance: ## test every method against the contract, slow cases too, and write docs/results/conformance.md
+	OMP_NUM_THREADS=1 $(BIN)/pytest --no-cov -q tests/contract/test_contract.py --conformance=docs/results/conformance.md
+bench: ## time every operator, a step and a frame, into docs/results/performance.md (a quarter of an hour)
 	$(BIN)/python -m tests.bench.performance
 
 accuracy-time: ## accuracy of each choice against training time [MODEL=forward DATA= SCENES= MINUTES= CHANGES= SEEDS=3]

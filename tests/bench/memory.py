@@ -208,7 +208,7 @@ def memory_table(cases: Sequence[tuple] = ()) -> str:
 
 
 def main(arguments: Sequence[str]) -> None:
-    """Write the table into docs/performance.md; with ``--fit FILE OVERRIDES`` be what is measured."""
+    """Write the table into docs/results/performance.md; with ``--fit FILE OVERRIDES`` be what is measured."""
     if arguments[:1] == ["--fit"]:
         fitted(Path(arguments[1]), arguments[2:])
         return
@@ -221,7 +221,7 @@ def main(arguments: Sequence[str]) -> None:
     text = memory_table([(frames, CAMERAS, SIZE) for frames in given.frames or ()])
     print(text)
     if not given.frames:
-        replace_section(project_root() / "docs" / "performance.md", "memory", text)
+        replace_section(project_root() / "docs" / "results" / "performance.md", "memory", text)
 
 
 if __name__ == "__main__":

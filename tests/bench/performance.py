@@ -1,4 +1,4 @@
-"""``python -m tests.bench.performance``: write the tables of docs/performance.md, as ``make bench`` does."""
+"""``python -m tests.bench.performance``: write the tables of docs/results/performance.md, as ``make bench`` does."""
 
 from __future__ import annotations
 
@@ -142,11 +142,11 @@ SECTIONS = {
 def main(arguments: Sequence[str] | None = None) -> None:
     """Measure, and write the tables."""
     parser = argparse.ArgumentParser(prog="python -m tests.bench.performance", description=__doc__)
-    parser.add_argument("--document", type=Path, default=None, help="instead of docs/performance.md")
+    parser.add_argument("--document", type=Path, default=None, help="instead of docs/results/performance.md")
     parser.add_argument("--only", nargs="*", default=tuple(SECTIONS))
     given = parser.parse_args(arguments)
     quiet()
-    document = given.document or project_root() / "docs" / "performance.md"
+    document = given.document or project_root() / "docs" / "results" / "performance.md"
     for name in given.only:
         text = SECTIONS[name]()
         print(f"{name}\n{text}\n", flush=True)

@@ -1,4 +1,4 @@
-"""Write the small scenes once, fit every method once to each, and write docs/conformance.md from the results.
+"""Write the small scenes once, fit every method once to each, and write docs/results/conformance.md from the results.
 
 Tests share these files and fitted methods and must not change them.
 """
@@ -21,7 +21,7 @@ HEAD = """# Conformance
 What each method was seen to do by the contract suite (`tests/contract`), on one scene of 20 pixels and 6
 times in the format of each dataset: D-NeRF, HyperNeRF, NHR, Lego Complete, DyNeRF; what does not depend on
 the format (equal, stopped and killed runs, a voxel stage beside) in D-NeRF's alone. Written by `make
-conformance`; do not edit. How a method joins: [extending](extending.md).
+conformance`; do not edit. How a method joins: [extending](../extending.md).
 """
 
 

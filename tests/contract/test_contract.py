@@ -279,7 +279,7 @@ def check_handover(handover, scene):
 
 
 def kinds_of(method, entry, losses):
-    """Return what a method says of itself, by the heads of the columns of docs/conformance.md."""
+    """Return what a method says of itself, by the heads of the columns of docs/results/conformance.md."""
     can = {"trajectories": HasTrajectories, "bounds": HasBounds, "matter": HasMatter}
     asks, share = method.asks, sum(losses[-10:]) / 10 / (sum(losses[:5]) / 5)
     asked = [f"{asks.kind} of side {asks.side}" if asks.kind == "crops" else asks.kind]

@@ -1,6 +1,6 @@
 """Hard cases of every operator, in float32 against float64: how many digits are left.
 
-``python -m tests.stability.report`` writes them as the table of docs/stability.md.
+``python -m tests.stability.report`` writes them as the table of docs/results/digits.md.
 """
 
 from __future__ import annotations
@@ -364,7 +364,7 @@ def replace_section(path: Path, name: str, text: str) -> None:
 def main() -> None:
     """Measure, and write the table."""
     quiet()
-    document = project_root() / "docs" / "stability.md"
+    document = project_root() / "docs" / "results" / "digits.md"
     replace_section(document, "operators", operator_table())
     print(document)
 

@@ -1,4 +1,4 @@
-"""The table of docs/stability.md: its marks, its errors, and the tests that it names."""
+"""The tables of docs/stability.md and docs/results/digits.md: marks, errors, and the tests that they name."""
 
 import ast
 import re
