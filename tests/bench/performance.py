@@ -1,4 +1,4 @@
-"""``python -m tests.bench.performance``: write the tables of docs/results/performance.md, as ``make bench`` does."""
+"""``python -m tests.bench.performance``: write docs/results/performance.md, as ``make bench`` does."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Write the small scenes once, fit every method once to each, and write docs/results/conformance.md from the results.
+"""Write small scenes once, fit every method to each, and write docs/results/conformance.md from the results.
 
 Tests share these files and fitted methods and must not change them.
 """
