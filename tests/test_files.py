@@ -4,11 +4,13 @@ import errno
 import os
 
 import pytest
+from omegaconf import OmegaConf
 
 from forewarp.files import (
     check_replaceable,
     folder_written_whole,
     load_json,
+    load_yaml,
     read_json,
     read_text,
     replace_file,
@@ -75,6 +77,27 @@ def test_what_is_no_object_is_none(tmp_path, text):
     assert read_json(path) is None
     with pytest.raises(ValueError, match=f"{path}: .*expected"):
         load_json(path)
+
+
+@pytest.mark.parametrize("name", ["a.json", "a.yaml"])
+def test_a_number_that_fits_no_float_is_refused(tmp_path, name):
+    path, load = tmp_path / name, load_json if name == "a.json" else load_yaml
+    path.write_text('{"a": 1%s, "b": [-2]}' % ("0" * 307))
+    assert load(path) == {"a": 10**307, "b": [-2]}
+    path.write_text('{"a": -1%s}' % ("0" * 400))
+    with pytest.raises(
+        ValueError, match=r"expected .*(at most 308.*402: -10000|402 digits, -10000.*at most 308)"
+    ):
+        load(path)
+
+
+def test_yaml_is_read_as_omegaconf_reads_it(tmp_path):
+    path = tmp_path / "a.yaml"
+    path.write_text(f"a: 1e-3\nb: 2020-01-01\nc: {'../x' * 99}\nd: 1_0e5\ne: 1e\n'1': x\n")
+    assert load_yaml(path) == OmegaConf.to_container(OmegaConf.load(path))
+    path.write_text("a: 1\nb:\n  c: 1\n  c: 2\n")
+    with pytest.raises(ValueError, match="a.yaml: expected YAML, but got the key 'c' twice in line 4"):
+        load_yaml(path)
 
 
 def test_nothing_is_read_of_a_file_that_is_too_large_or_no_file(tmp_path):

@@ -9,7 +9,7 @@ from forewarp.runs.config import read_config
 
 GOOD = {"model": {"name": "forward"}, "data": {}, "objective": None, "stage": {"fine": {"curriculum": {}}}}
 GOOD |= {"preset": {"name": "demo"}, "budget": {}, "seed": 0, "trainer": {}, "callbacks": {"accuracy": None}}
-BIG = int("9" * 400)
+BIG = int("9" * 300)
 
 
 @pytest.mark.parametrize(

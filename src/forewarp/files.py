@@ -39,7 +39,10 @@ _FULL = errno.ENOSPC, errno.EDQUOT, errno.EFBIG  # what a full disk says
 _LEFT = 24 * 3600  # seconds after which nobody fills a folder any more
 _PLAIN_TAGS = {f"tag:yaml.org,2002:{kind}" for kind in ("str", "int", "float", "bool", "null", "map", "seq")}
 _PLAIN_TAGS |= {None, "!"}
-_DIGITS = 4300  # of a number; those of sixty parts take time that grows by the square
+_DIGITS = (
+    308  # of a number: larger ones fit no float, those of sixty parts take time that grows by the square
+)
+_NUMBER = re.compile(r"[-+]?\.?[0-9][\w.:+-]*")  # of any notation of YAML
 
 
 def disk_error(said: str, path: Path) -> OSError:
@@ -237,6 +240,15 @@ def read_json(path: Path) -> dict | None:
         return None
 
 
+def _whole(digits: str) -> int:
+    """Read a whole number of JSON."""
+    if len(digits) > _DIGITS:
+        raise ValueError(
+            f"a number of {len(digits)} digits, {digits[:10]}...; write one of at most {_DIGITS}"
+        )
+    return int(digits)
+
+
 def load_json(path: Path, top: type = dict) -> dict | list:
     """Read the object of a JSON file, or the list where ``top`` is list.
 
@@ -246,11 +258,11 @@ def load_json(path: Path, top: type = dict) -> dict | list:
     """
     text = decoded(read_bytes(path), path)
     try:
-        content = json.loads(text)
+        content = json.loads(text, parse_int=_whole)
     except json.JSONDecodeError as error:
         raise ValueError(f"{path}: line {error.lineno}: expected JSON, but got {error.msg}") from error
     except (ValueError, RecursionError) as error:  # absurd numbers or nesting
-        raise ValueError(f"{path}: expected JSON, but got {short(str(error))}") from error
+        raise ValueError(f"{path}: expected JSON, but got {str(error)[:80]}") from error
     if not isinstance(content, top):
         kind = "object" if top is dict else top.__name__
         raise ValueError(f"{path}: expected a JSON {kind} at the top, but got {type(content).__name__}")
@@ -265,32 +277,54 @@ def check_command(command: object, where: object) -> None:
 
 
 class _PlainLoader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):
-    """PyYAML's safe loader without dates, which are texts."""
+    """PyYAML's safe loader as OmegaConf has it: dates are texts, 1e-3 is a number, no key stands twice."""
 
     yaml_implicit_resolvers = {
         first: [(tag, pattern) for tag, pattern in kinds if not tag.endswith(":timestamp")]
         for first, kinds in yaml.SafeLoader.yaml_implicit_resolvers.items()
     }
 
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict:
+        """Make a dict, and refuse a key that stands there twice."""
+        names = set()
+        for key, _ in node.value:
+            if isinstance(key, yaml.ScalarNode) and key.value in names:
+                raise yaml.constructor.ConstructorError(
+                    None, None, f"the key {key.value!r:.80} twice", key.start_mark
+                )
+            names.add(key.value if isinstance(key, yaml.ScalarNode) else None)
+        return super().construct_mapping(node, deep)
+
+
+_PlainLoader.add_implicit_resolver(
+    "tag:yaml.org,2002:float", re.compile(r"[-+]?[0-9]+(?:_[0-9]+)*[eE][-+]?[0-9]+$"), list("-+0123456789")
+)
+
 
 def load_yaml(path: Path, *, texts: bool = False) -> object:
-    """Read plain data from a YAML file of at most ``MOST_CONFIG`` bytes.
+    """Read plain data from a YAML file of at most ``MOST_CONFIG`` bytes; as ``parse_yaml``."""
+    return parse_yaml(read_text(path, MOST_CONFIG), path, texts=texts)
+
+
+def parse_yaml(text: str, where: object, *, texts: bool = False) -> object:
+    """Parse plain data.
 
     Args:
-        path: of the file.
+        text: the YAML.
+        where: named in errors.
         texts: leave all values as text, as they stand there.
 
     Raises:
-        OSError: where it cannot be read.
         ValueError: in one line, for what does not parse, and as ``check_yaml``.
     """
-    text = read_text(path, MOST_CONFIG)
     try:
-        check_yaml(text, path)
+        check_yaml(text, where)
         return yaml.load(text, yaml.BaseLoader if texts else _PlainLoader)
     except (yaml.YAMLError, RecursionError) as error:
-        reason = (str(error).splitlines() or [type(error).__name__])[0]
-        raise ValueError(f"{path}: expected YAML, but got {reason}") from error
+        reason = getattr(error, "problem", None) or (str(error).splitlines() or [type(error).__name__])[0]
+        line = getattr(getattr(error, "problem_mark", None), "line", None)
+        at = "" if line is None else f" in line {line + 1}"
+        raise ValueError(f"{where}: expected YAML, but got {reason}{at}") from error
 
 
 def check_yaml(text: str, where: object) -> None:
@@ -311,8 +345,9 @@ def check_yaml(text: str, where: object) -> None:
             expected = "YAML of texts, numbers, true, false, null, lists and mappings"
             raise ValueError(f"{where}: expected {expected}, but got the tag {tag[:80]}; write plain values")
         is_plain = isinstance(event, yaml.ScalarEvent) and event.implicit[0]
-        if is_plain and len(event.value) > _DIGITS and event.value[0] in "+-.0123456789":
-            raise ValueError(f"{where}: expected numbers of at most {_DIGITS} digits, but got more")
+        if is_plain and len(event.value) > _DIGITS and _NUMBER.fullmatch(event.value):
+            got = f"{len(event.value)}: {event.value[:10]}..."
+            raise ValueError(f"{where}: expected numbers of at most {_DIGITS} digits, but got {got}")
         level += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
         if level > MOST_LEVELS:
             raise ValueError(f"{where}: expected at most {MOST_LEVELS} levels, but got more")

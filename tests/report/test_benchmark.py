@@ -244,7 +244,9 @@ def test_published_points_are_read_and_checked(tmp_path):
         with pytest.raises(ValueError, match=r"published.yaml: expected entries with the keys name, seconds"):
             read_published(path)
     path.write_text("[")
-    with pytest.raises(ValueError, match="published.yaml: expected YAML, but got while parsing"):
+    with pytest.raises(
+        ValueError, match="published.yaml: expected YAML, but got did not find expected node content"
+    ):
         read_published(path)
 
 

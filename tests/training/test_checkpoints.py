@@ -54,6 +54,25 @@ def test_another_configuration_is_refused_by_what_differs(tmp_path, interrupted,
         checkpoints.load_weights(module(tmp_path, **changes), interrupted)
 
 
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"density_scale": "x"},
+        {"lattices": {"home": torch.ones(2, 2, 2) > 0, "followed": {"other": [1000, 0]}}},
+        {"lattices": {"home": torch.ones(2, 2, 2) > 0, "followed": {"num_voxels": [1000, "x"]}}},
+        {"lattices": {"home": 3, "followed": {"num_voxels": [1000, 0]}}},
+        {"lattices": []},
+    ],
+    ids=str,
+)
+def test_a_state_that_is_not_the_methods_is_refused(tmp_path, interrupted, change):
+    content = torch.load(interrupted, weights_only=True)
+    content["state_dict"]["method._extra_state"] |= change
+    torch.save(content, tmp_path / "last.ckpt")
+    with pytest.raises(ValueError, match="differs in method._extra_state; use another run folder"):
+        checkpoints.check_checkpoint(tmp_path / "last.ckpt", module(tmp_path))
+
+
 def test_one_flipped_bit_is_refused(tmp_path, interrupted):
     content = bytearray(interrupted.read_bytes())
     stored = torch.load(interrupted, weights_only=True)["state_dict"]["method.radiance.density"]

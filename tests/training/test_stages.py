@@ -92,6 +92,7 @@ def test_what_a_run_leaves(whole):
     [
         ({"voxel": 1}, "unexpected keyword argument 'voxel'"),
         ({"keep_alpha": 2.0}, "stage.fine: expected 0 < birth_alpha < keep_alpha < 1"),
+        ({"keep_alpha": None}, "stage.fine: expected 0 < birth_alpha < keep_alpha < 1"),
         ({"curriculum": {"start": 0}}, "stage.fine.curriculum: expected start >= 1, "),
         ({"weights": {"photos": 1.0}}, "objective: expected a term of photo, .*but got 'photos'"),
     ],

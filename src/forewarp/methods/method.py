@@ -266,6 +266,15 @@ class Method(nn.Module):
         super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
 
 
+def misread(name: str, read: Callable[[], object]) -> str | None:
+    """Return the name of a stored entry whose content ``read`` cannot read; None if it can."""
+    try:
+        read()
+    except (KeyError, TypeError, ValueError, AttributeError, OverflowError):
+        return name
+    return None
+
+
 def part_of(method: nn.Module, name: str) -> Tensor:
     """Return a parameter or buffer by its dotted name."""
     place, _, last = name.rpartition(".")

@@ -20,6 +20,7 @@ from forewarp.methods.method import (
     Step,
     check_least,
     check_number,
+    misread,
     steps_of,
     those_that_hold,
 )
@@ -587,12 +588,20 @@ class MarchedMethod(RayMethod):
 
     def set_extra_state(self, state: dict) -> None:
         """Adopt a checkpoint's box."""
-        self.box = Box(tuple(state["low"]), tuple(state["high"]))
+        self.box = _box(state)
+
+    def misfit(self, state: Mapping[str, Tensor]) -> str | None:
+        """See ``Method``; the box is one, too."""
+        return super().misfit(state) or misread("_extra_state", lambda: _box(state["_extra_state"]))
 
     def departures(self) -> list[str]:
         """See ``Method``; a subclass adds its own to those of the marching."""
         looks = self.marching.occupancy and self.marching.look_every
         return [ALONG_RAYS, ONE_TIME, *(["empty space is not sampled"] if looks else [])]
+
+
+def _box(state: dict) -> Box:
+    return Box(tuple(state["low"]), tuple(state["high"]))
 
 
 def whole_grid(lattice: Lattice, channels: dict[str, int]) -> VoxelGrid:

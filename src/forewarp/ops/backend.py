@@ -12,6 +12,7 @@ import re
 import sys
 import threading
 from collections.abc import Callable
+from contextlib import suppress
 from functools import cache
 from typing import Any
 
@@ -80,9 +81,14 @@ def is_number(value: Any) -> bool:
 def check_value(key: str, given: Any, wanted: str, good: Callable[[Any], bool], advice: str = "") -> None:
     """Raise ValueError unless a value is ``good``: name its key, what is wanted, what came, what to do.
 
+    A value of a kind that ``good`` cannot compare, as null with a number, is none.
+
     >>> check_value("model.width", 2, "a number > 0", lambda number: number > 0)
     """
-    if not good(given):
+    is_good = False
+    with suppress(TypeError, AttributeError, LookupError, OverflowError):
+        is_good = good(given)
+    if not is_good:
         raise ValueError(f"{key}: expected {wanted}, but got {given!r}" + (f"; {advice}" if advice else ""))
 
 

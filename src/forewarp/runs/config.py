@@ -18,14 +18,13 @@ from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from pathlib import Path
 
-import yaml
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from forewarp.data.files import RECORD, mismatch, number, one_of
-from forewarp.files import MOST_CONFIG, check_command, check_yaml, read_text, refuse_links
+from forewarp.files import MOST_CONFIG, check_command, parse_yaml, read_text, refuse_links
 from forewarp.outline import check_outline
 from forewarp.runs.devices import device_for
 from forewarp.runs.overrides import constant, key_of, typed_overrides
@@ -61,9 +60,8 @@ HOMES = {
     "logger": ("lightning.pytorch.loggers.", "forewarp.training.loggers.CsvLogger"),
 }
 _RESERVED = {"_target_", "_partial_", "_recursive_", "_convert_"}
-# What OmegaConf and PyYAML raise for a text that is no config.
-_UNREADABLE = yaml.YAMLError, OmegaConfBaseException, ValueError, TypeError
-_UNREADABLE += AssertionError, OverflowError, RecursionError
+# What OmegaConf raises for plain data that are no config.
+_NO_CONFIG = OmegaConfBaseException, ValueError, TypeError, AssertionError
 _PARTS = {"name", "version", "sub_dir"}  # keys that make up the path a logger writes to
 # Its others.
 _PLAIN = {"default_hp_metric", "flush_logs_every_n_steps", "log_graph", "prefix"}
@@ -308,21 +306,16 @@ def trusted_config(
             ``ELSEWHERE``, nor defined in a trusted package; or if a logger would write outside the run's
             folder.
     """
-    try:
-        check_yaml(text, where)
-        config = OmegaConf.create(text)
-        content = OmegaConf.to_container(config)
-    except _UNREADABLE as error:
-        if str(error).startswith(f"{where}: "):
-            raise
-        reason = (str(error).splitlines() or [type(error).__name__])[0]
-        raise ValueError(f"{where}: expected YAML, but got {reason}; delete the run's folder") from None
+    content = parse_yaml(text, where)
     if not isinstance(content, dict):
         raise ValueError(f"{where}: expected a mapping, but got another kind; delete the run's folder")
-    for key in unused:
-        config[key] = content[key] = {}
+    content |= {key: {} for key in unused}
     _check(content, where, "", trust)
-    return config
+    try:
+        return OmegaConf.create(content)
+    except _NO_CONFIG as error:
+        reason = (str(error).splitlines() or [type(error).__name__])[0]
+        raise ValueError(f"{where}: expected a config, but got {reason}; delete the run's folder") from None
 
 
 def trust_of(named: str | Iterable[str] | None = None) -> tuple[str, ...]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from functools import partial
@@ -21,10 +22,10 @@ from forewarp.fields.grids import (
     mean_color,
     shaded,
 )
-from forewarp.methods.method import Method, Snapshot, Start, Step
+from forewarp.methods.method import Method, Snapshot, Start, Step, misread
 from forewarp.methods.voxel.effects import Together
 from forewarp.methods.voxel.structure import VoxelStage, first_voxels, refresh, resample
-from forewarp.ops.backend import check_value
+from forewarp.ops.backend import check_value, is_number
 from forewarp.ops.grid import neighbour_pairs
 from forewarp.ops.march import warm_up
 from forewarp.renderer import Marched, Renderer
@@ -419,10 +420,25 @@ class VoxelMethod(Method):
 
     def set_extra_state(self, state: dict) -> None:
         """Adopt a checkpoint's state."""
+        scale, self.home, self.followed = self._read_state(state)
         for grid in self.grids.values():
-            grid.activation = Activation(grid.activation.shift, float(state["density_scale"]))
-        self.home = state["lattices"]["home"]
-        self.followed = {key: list(state["lattices"]["followed"][key]) for key in self.grids}
+            grid.activation = Activation(grid.activation.shift, scale)
+
+    def misfit(self, state: Mapping[str, Tensor]) -> str | None:
+        """See ``Method``; the lattices' schedule is of this stage's grids, too."""
+        return super().misfit(state) or misread(
+            "_extra_state", lambda: self._read_state(state["_extra_state"])
+        )
+
+    def _read_state(self, state: dict) -> tuple[float, Tensor, dict[str, list]]:
+        scale, home = float(state["density_scale"]), state["lattices"]["home"]
+        followed = {key: list(state["lattices"]["followed"][key]) for key in self.grids}
+        fits = torch.is_tensor(home) and (home.dtype, home.dim()) == (torch.bool, 3) and 0 < scale < math.inf
+        for present, since in followed.values():
+            fits = fits and (present is None or is_number(present)) and is_number(since)
+        if not fits:
+            raise ValueError("expected a length, flags of a lattice, and a size and a step for each grid")
+        return scale, home, followed
 
 
 def _carried(start: Start, stage: VoxelStage) -> VoxelMethod | None:
