@@ -22,7 +22,7 @@ from hydra_plugins.forewarp_one_at_a_time import changed
 from tests.support.configs import ROOT, composed
 
 PAPER = {"dnerf": 24, "hypernerf": 12, "nhr": 12, "lego_complete": 9, "ablation_modules": 60}
-PAPER |= {"ablation_losses": 32, "ablation_at_rest": 10, "resolution": 16, "methods": 24, "flow": 2}
+PAPER |= {"ablation_losses": 32, "ablation_converged": 10, "resolution": 16, "methods": 24, "flow": 2}
 OTHERS = {"accuracy_time", "effects", "price_list_forward", "price_list_particles", "search", "search_keys"}
 OTHERS |= {"minutes"}
 COUNTS = {"forward": 45, "particles": 48}

@@ -175,7 +175,7 @@ def test_an_interrupted_run_goes_on(forewarp, ok, refused, found, in_tmp):
     forget_mine()
     assert refused("train", "resume=run").endswith(ADVICE)
     assert "mine" not in sys.modules
-    assert "coarse: goes on at 50%, step 3" in ok("train", "resume=run", TRUST).out
+    assert "coarse: resuming at 50%, step 3" in ok("train", "resume=run", TRUST).out
     assert json.loads((in_tmp / "run" / "coarse" / "done.json").read_text())["steps"] == 6
 
 

@@ -62,7 +62,7 @@ def test_ablations_are_run_for_equal_minutes_and_equal_steps():
 def test_ablations_at_rest_take_a_lane_a_seed_and_end_by_the_presets_steps():
     sweeps, ((*_, out),) = planned("ablations PRESET=compact DATA=there")
     assert out == "out=docs/results"
-    common = {"sweeps=ablation_at_rest", "score=null", "paths.runs=runs/ablations", "paths.scenes=there"}
+    common = {"sweeps=ablation_converged", "score=null", "paths.runs=runs/ablations", "paths.scenes=there"}
     assert sweeps == [common | {"seed=0"}, common | {"seed=1"}]
     sweeps, _ = planned("ablations PRESET=compact SEEDS=4,7 STEPS=30")
     for sweep, seed in zip(sweeps, ("seed=4", "seed=7"), strict=True):

@@ -171,7 +171,7 @@ def test_a_begun_run_is_finished_and_measured_and_what_does_not_matter_may_chang
     done = ok(*arguments(scenes, begun, "checkpoint_seconds=5"))
     lines = done.out.splitlines()
     assert lines[2] == "coarse: finished before"
-    assert lines[3].startswith("fine: goes on at 100%, step ")
+    assert lines[3].startswith("fine: resuming at 100%, step ")
     assert numbers(begun)["test"] == numbers(fitted)["test"]
     assert yaml.safe_load((begun / "config.yaml").read_text())["checkpoint_seconds"] == 5
 

@@ -213,7 +213,7 @@ def test_a_run_that_was_stopped_continues_exactly(name, straight, scenes, tmp_pa
     torch.manual_seed(5)
     told = []
     again = run_of(stages, data_of("dnerf", scenes), tmp_path, tell=told.append).fit()
-    assert told == [f"fine: goes on at {STOP / STEPS:.0%}, step {STOP}"]
+    assert told == [f"fine: resuming at {STOP / STEPS:.0%}, step {STOP}"]
     assert_equal_states(straight(name), again)
     assert straight(name).last == again.last
 

@@ -55,8 +55,8 @@ def test_auto_takes_what_the_methods_belong_on(machine, accelerator, targets, cu
     machine(cuda=cuda, apple=True)
     config = on(accelerator, *targets)
     assert device_for(config) == torch.device(device)
-    is_left_aside = cuda and accelerator == "auto" and PARTICLES in targets
-    assert (why_on_cpu(config) is not None) == is_left_aside
+    is_on_cpu = cuda and accelerator == "auto" and PARTICLES in targets
+    assert (why_on_cpu(config) is not None) == is_on_cpu
 
 
 @pytest.mark.parametrize(
@@ -83,8 +83,8 @@ def test_it_says_why_and_how_to_choose_the_gpu(machine):
     run.datamodule.scene = SimpleNamespace(name="x", train=(), test=(), protocol={})
     first, second, third = beginning(run, config).splitlines()
     assert first.endswith("on the CPU")
-    assert second.startswith("model=particles leaves the GPU aside: its kernels are the CPU's")
-    assert second.endswith("; trainer=gpu runs it there all the same")
+    assert second.startswith("model=particles runs on the CPU: it has no GPU kernels")
+    assert second.endswith("; trainer=gpu runs it on the GPU")
     assert third == f"run: {run.folder}"
     config.trainer.accelerator = "cpu"
     assert len(beginning(run, config).splitlines()) == 2

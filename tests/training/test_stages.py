@@ -246,7 +246,7 @@ def test_a_request_to_end_keeps_the_step_that_it_met(tmp_path, whole, capsys, na
     ours.tell = told.append
     assert tiny.same(ours.fit(), whole[1])
     before = ["coarse: finished before"] if name == "fine" else []
-    assert told == [*before, f"{name}: goes on at {10 * (step + 1)}%, step {step + 1}", ENDED]
+    assert told == [*before, f"{name}: resuming at {10 * (step + 1)}%, step {step + 1}", ENDED]
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

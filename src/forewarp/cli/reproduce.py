@@ -296,7 +296,7 @@ def _at_rest(keys: Keys) -> Job:
     unused = ("minutes", "methods", "scenes", "sweeps", "model", "changes")
     if given := keys.given(*unused):
         raise ValueError(f"{', '.join(given)}: expected none beside preset=compact, but got some")
-    base = ["sweeps=ablation_at_rest", "score=null", "paths.runs=runs/ablations", *keys.given("views")]
+    base = ["sweeps=ablation_converged", "score=null", "paths.runs=runs/ablations", *keys.given("views")]
     base += _until(steps=keys.steps or "1") if keys.steps or keys.small else []
     base += [f"paths.scenes={keys.data}"] if keys.data else []
     seeds = keys.seeds or "2"

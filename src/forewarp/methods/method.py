@@ -108,7 +108,7 @@ class Method(nn.Module):
         grows: dotted names of the parameters and buffers whose number of rows may change during training;
             they adopt a checkpoint's. A part of it may have a ``grows`` of its own.
         loose: those of them that ``misfit`` itself compares with the others, as they have rows of their own.
-        on_cpu: why ``trainer=auto`` should leave a GPU aside, in a few words; None: it should not.
+        on_cpu: why ``trainer=auto`` should run it on the CPU, in a few words; None: it should not.
         betas: of Adam.
     """
 

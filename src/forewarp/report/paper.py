@@ -589,7 +589,7 @@ def write_ablation(folder: Path, out: Path, published: Path | None = None) -> li
     The part of a page already there that these runs do not fill, at rest or not, stays.
 
     Args:
-        folder: of runs of ``sweeps=ablation_modules``, ``ablation_losses`` and ``ablation_at_rest``.
+        folder: of runs of ``sweeps=ablation_modules``, ``ablation_losses`` and ``ablation_converged``.
         out: see above.
         published: file of the printed numbers; None: ``PAPER``.
 

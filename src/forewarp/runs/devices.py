@@ -41,7 +41,7 @@ def device_for(config: DictConfig) -> torch.device:
 
 
 def why_on_cpu(config: DictConfig) -> str | None:
-    """Say in a line why ``trainer=auto`` leaves a GPU aside; None where it does not, or there is none."""
+    """Say in a line why ``trainer=auto`` runs on the CPU beside a GPU; None where it does not, or there is none."""
     import torch
 
     if config.trainer.accelerator != "auto" or not torch.cuda.is_available():
@@ -54,7 +54,7 @@ def why_on_cpu(config: DictConfig) -> str | None:
             why = getattr(get_object(str(model.get("_target_"))), "on_cpu", None)
             if why is not None:
                 name = model.get("name", config.model.get("name"))
-                return f"model={name} leaves the GPU aside: {why}; trainer=gpu runs it there all the same"
+                return f"model={name} runs on the CPU: {why}; trainer=gpu runs it on the GPU"
     return None
 
 

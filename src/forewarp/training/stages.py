@@ -246,7 +246,7 @@ class Run:
         if checkpoint is not None:
             steps, seconds = checkpoints.check_state(checkpoint, module)
             fraction = module.settings.fraction(steps, seconds)
-            self.tell(f"{settings.name}: goes on at {fraction:.0%}, step {steps}")
+            self.tell(f"{settings.name}: resuming at {fraction:.0%}, step {steps}")
         loggers, module.trackers = self.loggers.open(steps_before, steps), self.loggers
         callbacks = [sentinel, *self.callbacks(settings.name, folder), keeper]
         trainer = self.make_trainer(folder, callbacks, loggers)

@@ -74,7 +74,7 @@ class Particles(Method):
     asks = Asks(kind="pictures", straight=True)
     loose = Skinning.ROWS  # a particle follows fewer nodes where there are few
     effects, still_steps = EFFECTS, 700  # a step is of one image
-    on_cpu = "its kernels are the CPU's"
+    on_cpu = "it has no GPU kernels"
 
     def __init__(
         self,
