@@ -16,6 +16,7 @@ from tests.export.conftest import exporter
 
 ROOM = World((3.0, -2.0, 0.5), 0.25)
 UTM = World((456_012.3, 4_650_123.7, 81.2), 0.25)
+MILLIMETRES = World((3000.0, -2000.0, 500.0), 0.25e-3)
 OPTIONS = {
     "ply": {"degree": 3, "up": "world", "compressed": False},
     "glb": {"quality": "lossless", "seconds": 1.0},
@@ -38,7 +39,7 @@ def of_ply(folder):
     maps = motion["maps"][-1][motion["links"]].astype(float)
     steps = (maps[..., :3] @ base[:, None, :, None] + maps[..., 3:])[..., 0]
     moved = base + (motion["weights"][..., None] * steps).sum(1)
-    np.testing.assert_allclose(moved, vertices(folder / "frames" / "frame_0002.ply"), atol=1e-4)
+    np.testing.assert_allclose(moved, vertices(folder / "frames" / "frame_0002.ply"), atol=1e-4, rtol=1e-5)
     return np.concatenate([base, moved, motion["node_places"]])
 
 
@@ -77,7 +78,7 @@ def of_npz(folder):
 PLACES = {"ply": of_ply, "glb": of_glb, "usd": of_usd, "mesh": of_mesh, "gltf": of_gltf, "npz": of_npz}
 
 
-@pytest.mark.parametrize("world", [ROOM, UTM], ids=["room", "UTM"])
+@pytest.mark.parametrize("world", [ROOM, UTM, MILLIMETRES], ids=["room", "UTM", "mm"])
 @pytest.mark.parametrize("kind", PLACES)
 def test_places_are_those_of_the_data(particles, tmp_path, kind, world):
     if kind == "usd":
@@ -88,8 +89,15 @@ def test_places_are_those_of_the_data(particles, tmp_path, kind, world):
     assert any(about["shift"]) == (world is UTM)
     assert about["normalisation"] == {"center": list(world.center), "scale": world.scale}
     assert json.loads((tmp_path / "data" / "about.json").read_text())["shift"] == about["shift"]
+    if kind == "usd":
+        stage = pytest.importorskip("pxr.Usd").Stage.Open(str(tmp_path / "data" / "scene.usdc"))
+        assert [*stage.GetRootLayer().customLayerData.get("shift", (0, 0, 0))] == about["shift"]
+    if kind == "ply":
+        assert np.load(tmp_path / "data" / "motion.npz")["shift"].tolist() == about["shift"]
     wanted = world.to_data(PLACES[kind](tmp_path / "scene")).numpy()
-    np.testing.assert_allclose(PLACES[kind](tmp_path / "data") + about["shift"], wanted, atol=1e-4, rtol=0)
+    np.testing.assert_allclose(
+        PLACES[kind](tmp_path / "data") + about["shift"], wanted, atol=max(1e-4, 1e-5 / world.scale), rtol=0
+    )
     for key in ("spacing", "radius"):
         assert about.get(key) == (pytest.approx(before[key] / world.scale) if key in before else None)
 

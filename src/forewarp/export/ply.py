@@ -218,7 +218,8 @@ def export_ply(
         write_ply(folder / "canonical.ply", {"vertex": splat_columns(template, degree)}, comments=comments)
         motion = movement_in_data(source.method.movement(source.times), world)
         motion = {name: value.cpu().numpy() for name, value in motion.items()}
-        np.savez(folder / "motion.npz", times=np.array(source.times, np.float32), **motion)
+        about = {"times": np.array(source.times, np.float32), "shift": np.array(source.shift)}
+        np.savez(folder / "motion.npz", **about, **motion)
     kind = "Gaussian splats, compressed" if compressed else "Gaussian splats"
     facts = {"particles": len(template), "kind": kind, "up": up}
     facts |= {"degree": degree, "degree of the run": own_degree}

@@ -69,6 +69,8 @@ def export_usd(
     stage.SetFramesPerSecond(_FPS)
     stage.SetStartTimeCode(codes[0])
     stage.SetEndTimeCode(codes[-1])
+    if any(source.shift):
+        stage.GetRootLayer().customLayerData = {"shift": Gf.Vec3d(*source.shift)}
     root = UsdGeom.Xform.Define(stage, "/scene")
     stage.SetDefaultPrim(root.GetPrim())
     field = UsdVol.ParticleField3DGaussianSplat.Define(stage, "/scene/particles")
