@@ -218,7 +218,9 @@ def test_black_bars_are_cut_off_and_told(tmp_path, rotation):
     for i in (0, 4, 8):
         Image.fromarray(np.pad(frames[i], ((0, 0), (20, 20), (0, 0)))).save(pictures / f"{i}.png")
     told = take(tmp_path, Source(images=pictures), step, None, None)
-    assert told.assumed == "black bars, 12% at the left and right each, stay: crop the pictures"
+    bars, times = told.assumed.split("; ", 1)
+    assert bars == "black bars, 12% at the left and right each, stay: crop the pictures"
+    assert times.startswith(f"{pictures}: times: taken from the numbers")
     pixels = np.asarray(Image.open(images.folder / next(iter(images.times))))[..., 0]
     assert pixels.max(1).min() > 150
     assert pixels.max(0).min() > 150

@@ -145,3 +145,13 @@ def test_another_file_is_no_scan(tmp_path):
     (tmp_path / "a.r3d").write_bytes(b"text")
     with pytest.raises(SceneError, match="expected a scan of Record3D, a ZIP archive, but got another file"):
         captured(tmp_path / "a.r3d", tmp_path / "a")
+
+
+def test_times_may_be_of_1970_and_must_grow(tmp_path):
+    stamps = [1.7e9 + 0.1 * i**2 for i in range(9)]
+    facts = captured(write_scan(tmp_path / "a.r3d", frameTimestamps=stamps), tmp_path / "a")
+    assert facts["seconds"] == pytest.approx(6.4)
+    with pytest.raises(
+        SceneError, match="frameTimestamps: expected seconds that grow, but got .* of frame 4"
+    ):
+        captured(write_scan(tmp_path / "b.r3d", frameTimestamps=[0, 1, 2, 3, 3, 4, 5, 6, 7]), tmp_path / "b")

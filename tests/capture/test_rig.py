@@ -130,6 +130,19 @@ def test_what_is_left_out_is_not_looked_at(tmp_path):
         rig.capture_rig(tmp_path, tmp_path.parent / "out", Search(), step, without=["b"], offsets=[0])
 
 
+def test_a_folder_called_as_videos_are_is_no_camera_left_out_without_a_word(tmp_path):
+    for number in range(2):
+        (tmp_path / f"cam{number}.mp4").touch()
+    for name in ("frames", "cam1"):  # of other use, and what was made of a video
+        (tmp_path / name).mkdir()
+    assert list(rig.cameras_in(tmp_path)) == ["cam0", "cam1"]
+    (tmp_path / "cam02").mkdir()
+    with pytest.raises(
+        ValueError, match="a video for each camera, as cam0, .* but got the folder cam02 beside"
+    ):
+        rig.cameras_in(tmp_path)
+
+
 def test_images_of_another_size_than_a_cameras_first_are_named(tmp_path):
     for name in "ab":
         (tmp_path / name).mkdir()

@@ -286,7 +286,7 @@ def _from_folder(folder: Path, source: Source, step: Step) -> dict:
                 brightest = np.maximum(brightest, pixels[..., :3].max(-1))
             progress(done, len(paths))
     if not as_stored:
-        assumed = _told(bars_of(brightest), "stay: crop the pictures") or assumed
+        assumed = "; ".join(filter(None, [_told(bars_of(brightest), "stay: crop the pictures"), assumed]))
     in_turn = [rows[path] for path in paths]
     return _record(times, in_turn, len(paths), widths, sizes, originals, assumed=assumed)
 

@@ -31,6 +31,7 @@ from forewarp.scene.frame import spread
 
 _MOST_SIDE, _UNITS, _MOST_BYTES = 1e5, (-1e6, 1e6), 200_000_000
 _MOST_DEPTH_SIDE = 2048  # pixels; LiDARs have 256 x 192, cameras of the face 640 x 480
+_SECONDS = 0.0, 1e11  # since the phone began or 1970
 _METADATA = 1 << 24  # bytes: parsed they take thirty times as many; of a frame about 150
 _ROOM = 1 << 26  # bytes that unpacking a plane may take beside what it holds
 _OVERHEAD = 4096  # bytes, at most, that compressed data are larger by: LZFSE stores blocks that do not shrink
@@ -118,7 +119,13 @@ class _Scan:
         if about.get("perFrameIntrinsicCoeffs"):
             self.intrinsics = self._rows("perFrameIntrinsicCoeffs", 4, count)
         if about.get("frameTimestamps"):
-            self.times = self.about.numbers("frameTimestamps", count, *_UNITS)
+            self.times = self.about.numbers("frameTimestamps", count, *_SECONDS)
+            back = next((i for i in range(1, count) if self.times[i] <= self.times[i - 1]), None)
+            if back is not None:
+                got = f"{self.times[back]:.10g} of frame {back} after {self.times[back - 1]:.10g}"
+                raise mismatch(
+                    self.about.where("frameTimestamps"), "seconds that grow", got, "remove the key"
+                )
         else:
             fps = self.about.number("fps", 1e-3, _MOST_SIDE)
             self.times = [i / fps for i in range(count)]

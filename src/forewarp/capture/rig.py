@@ -118,16 +118,24 @@ def cameras_in(folder: Path) -> dict[str, Path]:
     """Find the cameras of a rig, in the order of names: a video for each, else a sub-folder of images.
 
     Raises:
-        ValueError: for fewer than two, and for two videos of one name.
+        ValueError: for fewer than two, for two videos of one name, and for a sub-folder called as videos are,
+            with another number.
     """
     there = [path for path in folder.iterdir() if not path.name.startswith(".")]
     paths = [path for path in there if path.is_file() and path.suffix.lower() in VIDEOS]
     if twice := sorted(path.name for path in paths if sum(path.stem == one.stem for one in paths) > 1):
         raise mismatch(folder, "a video for each camera", " and ".join(twice[:2]))
     found = {path.stem: path for path in paths}
+    forms = {re.sub(r"\d+", "0", name) for name in found}
+    inner = [path for path in there if path.is_dir() and path.name not in found]
+    if like := in_order(path.name for path in inner if re.sub(r"\d+", "0", path.name) in forms):
+        expected = f"a video for each camera, as {in_order(found)[0]}, or sub-folders alone"
+        raise mismatch(
+            folder, expected, f"the folder {like[0]} beside them", "make a video of it, or move it"
+        )
     if not found:
-        inner = ((path, place) for path in there if path.is_dir() for place in (path, path / "images"))
-        found = {path.name: place for path, place in inner if place.is_dir() and images_in(place)}
+        places = ((path, place) for path in inner for place in (path, path / "images"))
+        found = {path.name: place for path, place in places if place.is_dir() and images_in(place)}
     if len(found) < 2:
         got = f"one, {next(iter(found))}; for one camera set video=" if found else "none"
         raise mismatch("videos", f"at least two videos, or sub-folders of pictures, in {folder}", got)

@@ -35,6 +35,7 @@ MASK = "masks/burnt_in.png"  # in the scene's folder: dark where something is bu
 _DRAWING, _BORDER = 640, 0.06  # pixels of each drawing; share of it that stays free at its ends
 _FIRST, _LAST, _BOX = (0.10, 0.25, 0.75), (0.85, 0.20, 0.15), (0.55, 0.55, 0.55)  # colours of cameras, box
 _FRUSTA = 24  # cameras drawn with their view
+_MOSTLY = 0.5  # share of pixels that move, beyond which masks may be the other way round
 
 
 @dataclass(frozen=True)
@@ -314,7 +315,9 @@ def moving_line(facts: dict) -> list[str]:
     """Say in a line how much moves, where that is known."""
     if facts["moving"] is None:
         return []
-    return [f"moving: {facts['moving']:.0%} of the pixels; test frames are scored there and elsewhere"]
+    line = f"moving: {facts['moving']:.0%} of the pixels; test frames are scored there and elsewhere"
+    advice = "; if what moves is dark in masks=, invert them" if facts["moving"] > _MOSTLY else ""
+    return [line + advice]
 
 
 def summary(facts: dict) -> list[str]:
