@@ -9,7 +9,9 @@ from itertools import product
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
+from forewarp.data.checks import remarks
 from forewarp.data.depth import SensedDepth
 from forewarp.data.hypernerf import read_camera, read_scene, write_camera
 from forewarp.data.images import write_image
@@ -370,3 +372,71 @@ def test_depth_of_another_size_is_taken_at_the_nearest_pixel(tmp_path):
     np.save(tmp_path / "a.npy", np.ones((4, 4)))
     with refused("expected depths of the proportions of its image, 12 x 8 pixels, but"):
         SensedDepth(tmp_path / "a.npy", camera, 1.0)()
+
+
+def evidence(folder, **changes):
+    """What is said of a phone's scene whose stored evidence is changed by functions, by a folder's name."""
+    write_rig(folder, film())
+    for kind, change in changes.items():
+        for path in sorted((folder / kind).rglob("*.*")):
+            if path.suffix == ".npy":
+                np.save(path, change(np.load(path)))
+            elif path.suffix == ".png":
+                write_image(path, change(np.array(Image.open(path))))
+            else:
+                path.write_text(json.dumps([change(row) for row in json.loads(path.read_text())]))
+    scene = read_scene(folder.parent, folder.name, depth="depth")
+    return "; ".join([*scene.protocol.get("assumed", []), *remarks(scene)])
+
+
+def test_evidence_that_says_little_or_other_things_is_told(tmp_path):
+    for number, (kind, change, said) in enumerate(
+        [
+            ("confidence", lambda values: values, ""),
+            ("confidence", lambda values: values > 0.9, ""),
+            (
+                "confidence",
+                lambda values: (100 * values).astype(np.uint8),
+                "confidence is at most 0.39, of 1",
+            ),
+            ("confidence", lambda values: 0 * values, "confidence is at most 0, of 1"),
+            ("covisible", lambda mask: 255 - mask, ""),  # half of them in either case
+            ("covisible", lambda mask: 0 * mask, "co-visible masks leave 0% of the test images"),
+            (
+                "keypoint",
+                lambda row: [row[0] / 12, row[1] / 8, row[2]],
+                "all lie in their first pixel; write x",
+            ),
+            (
+                "keypoint",
+                lambda row: [9 * row[0], 9 * row[1], row[2]],
+                "lie outside the images; write x and y",
+            ),
+            (
+                "depth",
+                lambda depth: np.where(depth == 0, 1000, depth),
+                "for holes; mend far in scene.json if",
+            ),
+        ]
+    ):
+        told = evidence(tmp_path / str(number), **{kind: change})
+        assert said in told
+        assert said or not told
+
+
+def test_evidence_elsewhere_and_cameras_counted_apart_are_told(tmp_path):
+    folder = write_rig(tmp_path / "toy", film())
+    (folder / "covisible" / "2x" / "val").rename(folder / "covisible" / "2x" / "test")
+    assert "covisible: none is read, as covisible/2x/test/" in str(
+        read_scene(tmp_path, "toy").protocol["assumed"]
+    )
+    write_rig(tmp_path / "rig")
+    for apart, said in ((0, []), (100, ["camera 0 films from time 0 to 0.0385, camera 1 from 0.962 to 1"])):
+        edit(
+            tmp_path / "rig" / "metadata.json",
+            lambda items, by=apart: [
+                e.update(time_id=e["time_id"] + by * e["camera_id"]) for e in items.values()
+            ],
+        )
+        lines = [line for line in remarks(read_scene(tmp_path, "rig")) if "films from" in line]
+        assert [line.partition(";")[0] for line in lines] == said

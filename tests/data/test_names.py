@@ -180,13 +180,14 @@ def test_a_pattern_that_cannot_be_used_is_refused(pattern, said):
 
 
 @pytest.mark.parametrize(
-    "form", ["C{:04d}.MP4_frame_{:04d}", "GX01{:04d}_frame_{:04d}", "clip{:02d}/frame_{:04d}"]
+    "form",
+    ["C{:04d}.MP4_frame_{:04d}", "GX01{:04d}_frame_{:04d}", "clip{:02d}/frame_{:04d}", "a{:03d}.mp4_t{:04d}"],
 )
 def test_frames_counted_anew_in_each_film_are_refused_without_poses(form):
     names = [form.format(film, n) for film in (1, 2) for n in range(1, 9)]
     with refused("films that are counted anew.*name_pattern"):
         read_names(names, "toy")
-    pattern = r"(?P<part>\d+)(\.MP4)?.frame_(?P<frame>\d+)"
+    pattern = r"(?i)(?P<part>\d+)(\.mp4)?.(frame_|t)(?P<frame>\d+)"
     assert read_names(names, "toy", pattern).frames == [*map(float, range(1, 17))]
     assert len({*read_names([f"cam{k}/frame_{n}" for k in (1, 2) for n in range(9)], "toy").cameras}) == 2
 

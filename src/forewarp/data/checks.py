@@ -91,6 +91,12 @@ def remarks(scene: Scene) -> Iterator[str]:
             line = f"masks leave {share:.0%} of the pixels to train on"
             yield f"{line}; {advice}, if it is the subject, invert them"
     yield from _of_motion(scene)
+    if covisible := [frame.load_covisible for frame in scene.test if frame.load_covisible is not None]:
+        shown = [covisible[i]().float().mean() for i in spread(len(covisible), _LOOKED_AT)]
+        if (share := float(torch.stack(shown).mean())) < _FEW:
+            line = f"co-visible masks leave {share:.0%} of the test images to measure on"
+            yield f"{line}; if they are dark where training images show the pixel too, invert them"
+    yield from _apart(scene)
     if scene.still is not None:
         cameras = [frame.camera for frame in scene.train]
         images = [torch.ones((), dtype=torch.bool).expand(c.height, c.width) for c in cameras]
@@ -243,6 +249,22 @@ def _silhouettes(scene: Scene, *, bounded: bool) -> Iterator[str]:
     if missed > _CUT_OFF * total:
         line = f"{missed / total:.0%} of the subject's pixels see nothing of the box {bounds(scene)}"
         yield f"{line} between near and far; {_remedy(scene, 'all')}"
+
+
+def _apart(scene: Scene) -> Iterator[str]:
+    """Say that cameras of a rig film one after the other, as if each were counted by itself."""
+    of_camera: dict[int, list[float]] = {}
+    for frame in (*scene.train, *scene.test):
+        if frame.camera_id is not None:
+            of_camera.setdefault(frame.camera_id, []).append(frame.time)
+    spans = sorted((min(times), max(times), camera) for camera, times in of_camera.items() if len(times) > 1)
+    for (first, end, one), (start, last, other) in zip(spans, spans[1:]):
+        if start - end > max(end - first, last - start) > 0:
+            line = (
+                f"camera {one} films from time {first:.3g} to {end:.3g}, camera {other} from {start:.3g} to"
+            )
+            yield f"{line} {last:.3g}; if they film together, count the images of one moment alike"
+            return
 
 
 def _of_motion(scene: Scene) -> Iterator[str]:

@@ -35,6 +35,7 @@ _NOWHERE = 10.0  # multiple of far, beyond which nothing is measured
 _REPEATED, _SEVERAL = 0.002, 2  # share and number of pixels of the largest depth, from which on it is none
 _UNITS = (1.0, MILLIMETRES, 1e-2, 1e2, 1e3, 2e-4, 1 / 256, 0.0254, 0.3048)  # that depth is written in
 _SAME_UNIT = 0.03
+_DOUBTED = 0.5  # confidence above which some depths are
 
 
 @dataclass(eq=False)
@@ -198,10 +199,17 @@ def _repeated(depth: np.ndarray) -> np.ndarray:
 
 
 def doubt_depths(
-    frames: Sequence[Frame], world: float, kind: str | None, where: object, unit: str, usual: str = "axis"
+    frames: Sequence[Frame],
+    world: float,
+    kind: str | None,
+    where: object,
+    unit: str,
+    *,
+    far_key: str = "set data.far",
+    usual: str = "axis",
 ) -> list[str]:
-    """Say in lines which numbers of metric depths are taken for holes, and that depths are in another unit;
-    else doubt their kind.
+    """Say in lines which numbers of metric depths are taken for holes, that hardly any is trusted, and that
+    depths are in another unit; else doubt their kind.
 
     Args:
         frames: in the order of time; some of those with depth are read.
@@ -209,6 +217,7 @@ def doubt_depths(
         kind: as typed, see ``doubt_kind``.
         where: what depths belong to.
         unit: what to do with the number that is the unit, ``set data.depth_scale={}``.
+        far_key: what to do where far is wrong.
         usual: the kind if none was typed: axis, as of films, or ray, as of images from all around.
 
     Raises:
@@ -233,8 +242,12 @@ def doubt_depths(
             most = Counter(found.tolist()).most_common(1)[0][0]
             more = "" if (found == most).all() else " and other numbers"
             line = f"{found.size / pixels:.2%} of the depths looked at are {most:.6g}{more}, {why}"
-            advice = "; set data.far if they are right" if "far" in why else ""
+            advice = f"; {far_key} if they are right" if "far" in why else ""
             lines.append(f"{where}: {line}: taken for holes{advice}")
+    trust = max(float(load()[1].max()) for load in loads)
+    if any(load.confidence for load in loads) and trust <= _DOUBTED:
+        line = f"confidence is at most {trust:.2g}, of 1, in the images looked at, so depth counts little"
+        lines.append(f"{where}: {line}; write 1, or 255 or level 2 as whole numbers, where it is sure")
     there = np.concatenate(kept)
     if there.size and not near < (middle := float(np.median(there))) < far:
         got = f"depth is {middle:.4g} in the median, with near at {near:.4g} and far at {far:.4g}"
@@ -433,6 +446,8 @@ def _are_full(values: np.ndarray) -> np.ndarray:
 def _read_confidence(path: Path) -> np.ndarray:
     """Read confidences (H, W) in [0, 1]: levels and bytes are whole numbers."""
     values = read_image(path)[..., 0].numpy() if path.suffix == ".png" else load_numpy(path)
+    if getattr(values, "dtype", np.dtype(float)).kind == "b":
+        values = values.astype(np.float64)
     values = _plane(values, path, "confidences (H, W)")
     most = 1.0 if values.dtype.kind == "f" else float(LEVELS if values.max() <= LEVELS else 255)
     if not (values.min() >= 0 and values.max() <= most):

@@ -63,6 +63,7 @@ from forewarp.scene.frame import Frame, Scene, Truth, middle_of
 
 _SCALES, _ASPECTS = (1e-6, 1e6), (1e-2, 1e2)
 _MOST_PIXELS, _MOST_PIXELS_OFF, _MOST_BENT = 1e5, 1e7, 1e3  # beyond them a camera file is wrong
+_OUTSIDE = 0.1  # share of keypoints outside the images, from which on they are of others
 _MOST_MOMENTS, _RATES = 1e9, (1e-3, 1e5)
 _EVERY = 4  # the published interpolation protocol: train on every fourth, test midway between
 
@@ -200,7 +201,9 @@ def read_scene(
             next(iter(dark.values()))()  # refuses it
         line = f"alpha is 0 everywhere in {len(dark)} images, which are left out ({min(dark)}, ..)"
         assumed.append(f"{images}: {line}; if alpha is of other use, set data.masks=off")
-    assumed += doubt_depths(train, size, depth_kind, folder / (depth or ""), "multiply it by {}")
+    advice = {"unit": "multiply it by {}", "far_key": "mend far in scene.json"}
+    assumed += doubt_depths(train, size, depth_kind, folder / (depth or ""), **advice)
+    assumed += _doubt_evidence(folder, scale, train, test)
     splits = {"train": train, "val": test}
     numbered = {split: {f.name: numbers[f.name] for f in part} for split, part in splits.items()}
     by_name = {f.name: f.camera for f in (*train, *test)}
@@ -389,8 +392,36 @@ def _read_keypoints(path: Path) -> Tensor:
     if not all(isinstance(row, list) and len(row) == 3 for row in rows):
         raise mismatch(path, "a list of [x, y, seen]", short(rows))
     points = torch.tensor([[number(value, str(path)) for value in row] for row in rows]).reshape(-1, 3)
+    points[:, 2] = (points[:, 2] > 0).float()
     points[:, :2] += 0.5 * points[:, 2:]
     return points
+
+
+def _doubt_evidence(folder: Path, scale: int, train: Sequence[Frame], test: Sequence[Frame]) -> list[str]:
+    """Say in lines that co-visible masks or keypoints are there and none is read, and that keypoints are not
+    in pixels of the images.
+    """
+    lines = []
+    for kind, used in (
+        ("covisible", [f for f in test if f.load_covisible is not None]),
+        ("keypoint", keyed := [f for f in train if f.keypoints is not None]),
+    ):
+        found = next((folder / kind).rglob("*.*"), None)
+        if found is not None and not used:
+            advice = f"with data.scale={scale} they lie in {kind}/{scale}x/, in a folder of the split's name"
+            lines.append(f"{folder / kind}: none is read, as {found.relative_to(folder)}; {advice}")
+    seen = [
+        f.keypoints[f.keypoints[:, 2] > 0, :2] / torch.tensor([f.camera.width, f.camera.height])
+        for f in keyed
+    ]
+    places = torch.cat(seen) if seen else torch.zeros(0, 2)
+    if len(places):
+        outside = float(((places < 0) | (places > 1)).any(1).float().mean())
+        pixel = 1.5 / min(keyed[0].camera.width, keyed[0].camera.height)
+        if outside > _OUTSIDE or float(places.max()) <= pixel:
+            got = f"{outside:.0%} lie outside the images" if outside else "all lie in their first pixel"
+            lines.append(f"{folder / 'keypoint'}: {got}; write x and y in pixels of rgb/{scale}x")
+    return lines
 
 
 def _read_items(path: Path, ids: list[str]) -> tuple[dict[str, int], dict[str, int | None], list[str]]:

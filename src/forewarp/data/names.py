@@ -36,7 +36,7 @@ _LETTER_WORD = re.compile(r"(?i)(?:^|[^a-z])[cv][_( -]*$")  # before two digits 
 _FILM_WORD = re.compile(
     r"(?i)(?:^|[^a-z])(c|gx|gh|gopr|gp|mvi|dsc|img|vid|mov|dji|clip|part|chapter|take|seg)[_-]?$"
 )
-_OF_FILM = re.compile(r"(?i)^\.(mp4|mov|mkv|avi|m4v|mts|webm)")  # behind it
+_OF_FILM = re.compile(r"(?i)^\.(mp$|m$|mov|mkv|avi|mts|webm)")  # behind it, up to the next number
 _SPLIT_WORD = re.compile(r"(?i)(?:^|/)(train|val|valid|validation|eval|test)\b")
 _OF_TIME = re.compile(r"(?:(\d+)[h:_.-])?(\d{1,2})[m:_.-](\d\d(?:[.,]\d+)?)s?")  # of a group ``time``
 _EXPONENT = re.compile(r"\d\.\d*[eE][-+]?\d")
