@@ -84,6 +84,18 @@ def test_what_torch_wrote_before_is_read_and_asks_for_no_more_either(tmp_path):
         read_archive(tmp_path / "a.pt", legacy=True)
 
 
+def test_a_packed_archive_is_refused(tmp_path):
+    """Zeros of a tensor take a thousandth of it on disk, and all of it once read."""
+    numbers = bytes(4 << 20)
+    archive(tmp_path / "a.pt", b"}X\x01\x00\x00\x00a" + b"".join(tensor(1 << 20)) + b"s", numbers)
+    assert read_archive(tmp_path / "a.pt")["a"].shape == (1 << 20,)
+    with zipfile.ZipFile(tmp_path / "a.pt") as plain, zipfile.ZipFile(tmp_path / "b.pt", "w") as packed:
+        for name in plain.namelist():
+            packed.writestr(name, plain.read(name), zipfile.ZIP_DEFLATED)
+    with pytest.raises(ValueError, match="BadZipFile"):
+        read_archive(tmp_path / "b.pt")
+
+
 def test_two_files_of_one_name_are_refused(tmp_path):
     with zipfile.ZipFile(tmp_path / "a.pt", "w") as file:
         file.writestr("archive/data.pkl", b"\x80\x02}.")
