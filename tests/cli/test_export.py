@@ -17,13 +17,14 @@ def test_it_writes_what_the_run_has_into_its_folder_and_says_so(forewarp, ok, fi
     run, sources, write = shutil.copytree(fitted, tmp_path / "vehicle"), [], formats.write
     text = (run / "config.yaml").read_text()
     assert "eval_background: white" in text
+    (run / "metrics.json").write_text('{"trust": {"degrees": 9.5}}')
     (run / "config.yaml").write_text(text.replace("eval_background: white", "eval_background: black"))
     noted = lambda kind, source, *a, **k: sources.append(source) or write(kind, source, *a, **k)  # noqa: E731
     monkeypatch.setattr(formats, "write", noted)
     done, folder = forewarp("export", str(run), "times=[0.25]"), run / "exports" / "ply"
     assert done.out.startswith(f"written: {folder}/frames/frame_0000.ply: 1 file"), done
     assert "ply 100% | 1/1" in done.err
-    assert sources[0].background == (0, 0, 0)
+    assert (sources[0].background, sources[0].trust) == ((0, 0, 0), 9.5)
     about = json.loads((folder / "about.json").read_text())
     assert (about["times"], about["method"]) == ([0.25], "forward")
     assert len(PlyData.read(folder / "frames" / "frame_0000.ply")["vertex"]) == about["points"]

@@ -12,6 +12,7 @@ import torch
 
 import forewarp
 from forewarp.export import glb
+from forewarp.glb.reader import read
 from forewarp.glb.writer import rows_in_file
 from forewarp.scene.view import Moment, View
 from tests.export.conftest import exporter
@@ -30,7 +31,7 @@ def export(source, folder, **options):
 
 
 def test_particles_are_written_with_what_a_page_needs(particles, tmp_path):
-    about, file = export(particles, tmp_path / "glb", quality="lossless")
+    about, file = export(replace(particles, trust=9.5), tmp_path / "glb", quality="lossless")
     scene, gaussians = forewarp.load(file), particles.method.moving()
     order, count, _ = rows_in_file(gaussians)
     assert (about["particles"], about["moving"], about["left out"]) == (len(order), count, 0)
@@ -48,6 +49,7 @@ def test_particles_are_written_with_what_a_page_needs(particles, tmp_path):
     description, _ = unpacked(file.read_bytes())
     assert description["extensionsUsed"] == ["KHR_gaussian_splatting", "FOREWARP_gaussian_motion"]
     assert [node["name"] for node in description["nodes"]][:3] == ["scene", "start", "camera 1"]
+    assert description["nodes"][0]["extras"]["trust_degrees"] == read(file).setting.trust == 9.5
 
 
 def test_what_no_training_image_shows_is_left_out_of_compact_files_and_not_missed(

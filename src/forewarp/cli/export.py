@@ -85,12 +85,14 @@ def saved_runs(config) -> list:
 def source_of(run, module, model: str, times: list[float]):
     """Return the ``Source`` of exports: a fitted ``module`` of a run, a ``model`` by its config, at times."""
     from forewarp.export.tracks import Source
+    from forewarp.runs.fitted import trust_degrees
 
     scene = run.datamodule.scene
     cameras, taken = [frame.camera for frame in scene.train], [frame.time for frame in scene.train]
     background = tuple(run.datamodule.targets("train").background.tolist())
     place = tuple(scene.protocol.get("span", (0.0, 1.0))), scene.protocol.get("window", [0.0])[0]
-    return Source(module, model, cameras, times, background, scene.name, taken, *place, world=scene.world)
+    more = {"world": scene.world, "trust": trust_degrees(Path(run.folder))}
+    return Source(module, model, cameras, times, background, scene.name, taken, *place, **more)
 
 
 def summary(about: dict) -> str:

@@ -17,7 +17,9 @@ from torch import Tensor
 
 from forewarp.clock import now
 from forewarp.drawing.images import at_least, depth_colors, depth_ends, error_colors, in_a_row, write_png
+from forewarp.evaluation.crossed import crossed_scores, drop_of
 from forewarp.evaluation.motion import measure_motion
+from forewarp.evaluation.trust import trust_of
 from forewarp.files import write_json
 from forewarp.methods.effect import switched
 from forewarp.methods.method import CarriesPixels, HasEllipsoids, HasLayers, HasTrajectories, parameter_count
@@ -124,6 +126,7 @@ def evaluate(
     chosen = middles(len(targets), views)
     if len(chosen) < len(targets):
         protocol["measured"] = f"{len(chosen)} of {len(targets)} test views, evenly spread"
+    whole = targets
     if reduce is not None:
         targets, protocol["reduced"] = targets.reduced(reduce), reduce
     on_sheets = {chosen[i] for i in spread(len(chosen), sheets)}
@@ -146,7 +149,11 @@ def evaluate(
             if not is_written:
                 (place / f"{frame.name}.png").unlink(missing_ok=True)
     per_image = [rows[number] for number in sorted(rows)]
-    parts = chain.from_iterable(row["parts"].items() for row in per_image)
+    parts = [part for row in per_image for part in row["parts"].items()]
+    if not scene.has_alpha and len(scene.instants) > 1:
+        crossed, absent = crossed_scores(module.method, scene, whole, chosen)
+        parts += crossed
+        protocol |= {"crossed": f"not measured: {absent}"} if absent else {}
     best, others = per_image[0]["rendering"], list(per_image[0]["others"])
     seconds = {name: float(done["seconds"]) for name, done in finished.items()}
     clocks = [done.get("clocks", {}) for done in finished.values()]
@@ -169,6 +176,8 @@ def evaluate(
         "effects": switched(module.method),
         "test": summarise(chain(((row["ability"], row["scores"]) for row in per_image), parts)),
     }
+    if trust := trust_of(module.method, scene, whole, chosen, drop_of(metrics["test"])):
+        metrics["trust"] = trust
     metrics["metrics"] = described(dict.fromkeys(n for scores in metrics["test"].values() for n in scores))
     if targets := [done["target"] for done in finished.values() if "target" in done]:
         metrics["target"] = targets[-1]

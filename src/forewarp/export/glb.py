@@ -86,7 +86,9 @@ def packed_scene(
     numbers = sorted({0, *spread(len(cameras), _CAMERAS)})
     shown, taken = [cameras[n] for n in numbers], [times[n] for n in numbers] if times else []
     rotation, focus = source.rotation_to("y"), focus_point(cameras)
-    setting = Setting(shown, rotation, focus, float(seconds), source.background, taken, source.shift)
+    setting = Setting(
+        shown, rotation, focus, float(seconds), source.background, taken, source.shift, _trust(windows)
+    )
     many = int(shared[0][rows[0].order].sum())
     left_out = sum(len(gaussians.means) for gaussians, *_ in parts) - written - many * len(source.later)
     facts = {"particles": written, "moving": sum(part.in_motion for part in rows), "left out": left_out}
@@ -97,6 +99,12 @@ def packed_scene(
         for window, world, (gaussians, *_), part in zip(windows, worlds, parts, rows)
     ]
     return write(film, setting, quality, many), facts
+
+
+def _trust(windows: Sequence[Source]) -> float | None:
+    """Return the angle up to which images of all windows are good, degrees; None if one was not measured."""
+    angles = [window.trust for window in windows]
+    return None if None in angles else min(angles)
 
 
 def shared_in(windows: Sequence[Source]) -> list[Tensor]:

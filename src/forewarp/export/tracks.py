@@ -44,7 +44,8 @@ class Source:
     [0, 1], the ``background`` (3,) in [0, 1] of its images, the scene's ``name``, and, if known,
     ``image_times``, when each camera took its image. Of a film in windows it is the first one, whose time 0
     and 1 are those of the film in ``span``; ``later`` are the others, each shown from its ``begin`` on.
-    ``world`` is where all of this lies in the world of the data.
+    ``world`` is where all of this lies in the world of the data. ``trust``: the angle, degrees, up to which
+    its images are good beside the path of the cameras, if the run was measured.
     """
 
     module: DynamicSceneModule
@@ -58,6 +59,7 @@ class Source:
     begin: float = 0.0
     later: Sequence[Source] = ()
     world: World = SAME
+    trust: float | None = None
 
     @property
     def method(self) -> Method:

@@ -18,7 +18,7 @@ from forewarp.fields.windows import MovingWindows, Window, check_windows, taken,
 from forewarp.files import MOST_CONFIG, read_bytes
 from forewarp.glb import meshopt
 from forewarp.glb.container import CAMERA_AXES, CHUNKS, COMPONENTS, COMPRESSION, ELEMENTS, MAGIC, VERSION
-from forewarp.glb.writer import FORMAT, MOTION, QUATERNIONS, SPLATS, WINDOWS, Setting
+from forewarp.glb.writer import FORMAT, MOTION, QUATERNIONS, SPLATS, TRUST, WINDOWS, Setting
 from forewarp.ops.backend import is_number
 from forewarp.ops.layout import LOG_MIN_ALPHA
 from forewarp.scene.camera import Camera, Lens
@@ -266,12 +266,14 @@ def _scene(container: Container) -> Contents:
     gaussians = _gaussians(container, attributes, motion)
     if WINDOWS in motion:
         gaussians = _windows(container, gaussians, motion)
+    extras = description.parts("nodes")[number].part("extras", {})
     setting = Setting(
         *_cameras(description, number),
         torch.tensor(motion.numbers("focus", 3, [0, 0, 0]), dtype=torch.float64),
         motion.number("seconds", 1e-3, 1e6, 4),
         tuple(motion.numbers("background", 3, [1, 1, 1])),
-        shift=tuple(description.parts("nodes")[number].part("extras", {}).numbers("shift", 3, [0, 0, 0])),
+        shift=tuple(extras.numbers("shift", 3, [0, 0, 0])),
+        trust=extras.number(TRUST, 0, 180) if TRUST in extras else None,
     )
     return Contents(gaussians, setting)
 

@@ -22,6 +22,7 @@ from forewarp.scene.camera import Camera
 SPLATS, MOTION = "KHR_gaussian_splatting", "FOREWARP_gaussian_motion"
 FORMAT = "1.1"
 WINDOWS = "windows"  # a feature, and the property that describes it
+TRUST = "trust_degrees"  # in the extras of the node
 QUATERNIONS = "quaternions"  # a feature: rotations of nodes have four numbers
 COMPACT, LOSSLESS = "compact", "lossless"
 _LEAST_NEAR = 1e-6  # of a camera's far plane: glTF's near plane lies in front of the camera
@@ -34,7 +35,8 @@ class Setting:
     """What a page needs besides the Gaussians: ``cameras`` that have seen them, the first one to begin at;
     the ``rotation`` (3, 3) that makes y point upwards; the ``focus`` (3,) to turn about, world units; how
     many ``seconds`` time lasts from 0 to 1; the ``background`` (3,), sRGB; ``times``, when each camera took
-    its image, where that is known; and the ``shift`` (3,) that was left out of all places, world units.
+    its image, where that is known; the ``shift`` (3,) that was left out of all places, world units; and
+    ``trust``, degrees from the filmed path up to which images are good, where that was measured.
     """
 
     cameras: Sequence[Camera]
@@ -44,6 +46,7 @@ class Setting:
     background: tuple[float, float, float]
     times: Sequence[float] = ()
     shift: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    trust: float | None = None
 
 
 def write(windows: Sequence[tuple[Window, Rows]], setting: Setting, quality: str, shared: int = 0) -> bytes:
@@ -73,7 +76,9 @@ def write(windows: Sequence[tuple[Window, Rows]], setting: Setting, quality: str
     for camera, time in zip(cameras, setting.times):
         camera["extras"]["time"] = time
     node = {"name": "scene", "rotation": quaternion_of(setting.rotation), "mesh": 0}
-    node |= {"extras": {"shift": list(setting.shift)}} if any(setting.shift) else {}
+    extras = {"shift": list(setting.shift)} if any(setting.shift) else {}
+    extras |= {} if setting.trust is None else {TRUST: setting.trust}
+    node |= {"extras": extras} if extras else {}
     nodes = [node | {"children": list(range(1, len(cameras) + 1))}]
     for number, camera in enumerate(setting.cameras):
         pose = camera.camera_to_world[:3, :3].double() * CAMERA_AXES

@@ -20,6 +20,7 @@ if TYPE_CHECKING:  # so that reports and refusals wait for no torch
 LPIPS_METRICS = tuple(f"lpips_{net}" for net in NETS)
 ABILITIES = ("space", "time", "space_time", "canonical", "all")
 PARTS = ("moving", "still")  # of images whose masks say what moves
+CROSSED = ("crossed", "crossed_own")  # what rests, in the geometry of another time, and in its own
 
 log = logging.getLogger(__name__)
 
@@ -277,7 +278,7 @@ def summarise(rows: Iterable[tuple[str, Mapping[str, float]]]) -> dict[str, dict
 
     Args:
         rows: the ability (``space``, ``time``, ``space_time``, ``canonical`` or ``all``) or part (``moving``,
-            ``still``) and the scores of each image.
+            ``still``, ``crossed``, ``crossed_own``) and the scores of each image.
 
     Returns:
         ``{ability or part: {metric: mean}}`` in fixed order. A metric that some images lack is the mean over
@@ -289,7 +290,7 @@ def summarise(rows: Iterable[tuple[str, Mapping[str, float]]]) -> dict[str, dict
     >>> summarise([("time", {"psnr": 30.0}), ("space", {"psnr": 20.0}), ("time", {"psnr": 20.0})])
     {'space': {'psnr': 20.0}, 'time': {'psnr': 25.0}}
     """
-    collected: dict[str, dict[str, list[float]]] = {kind: {} for kind in (*ABILITIES, *PARTS)}
+    collected: dict[str, dict[str, list[float]]] = {kind: {} for kind in (*ABILITIES, *PARTS, *CROSSED)}
     for ability, scores in rows:
         if ability not in collected:
             raise ValueError(f"ability: expected one of {', '.join(collected)}, but got {ability!r}")

@@ -58,6 +58,7 @@ TEXTS = ("dataset", "day", "commit", "departures", "faults", "views", "curve", "
 KINDS = {"space": "at training times", "time": "between training times", "canonical": "at the canonical time"}
 KINDS |= {"space_time": "of cameras and between times held out", "all": "all"}
 KINDS |= {"moving": "what moves", "still": "what is still"}
+KINDS |= {"crossed": "what rests, crossed", "crossed_own": "the same pixels, not crossed"}
 COUNTERPART = "counterpart of "  # begins the dataset of synthetic scenes that stand in for its own
 # What pages tell of a run's protocol.
 PROTOCOL = ("half_resolution", "scale", "split", "frames", "views", "train_frames", "train_views")
@@ -325,11 +326,12 @@ def read_run(folder: Path) -> Row:
             images.append(of_image | {"psnr": scores["psnr"], "scores": scores})
     images.sort(key=lambda image: image["name"])
 
-    protocol, test, flow, sizes = (metrics.get(key) or {} for key in ("protocol", "test", "flow", "size"))
+    kept = "protocol", "test", "flow", "size", "trust"
+    protocol, test, flow, sizes, trust = (metrics.get(key) or {} for key in kept)
     scores = [
         (f"test.{kind}.{name}", value) for kind, of_kind in test.items() for name, value in of_kind.items()
     ]
-    _check_kind(folder / "metrics.json", scores)
+    _check_kind(folder / "metrics.json", [*scores, *((f"trust.{part}", at) for part, at in trust.items())])
     budget, variant, method = config["budget"], config.get("variant") or {}, config["model"]["name"]
     _check_kind(folder / "config.yaml", [(f"budget.{key}", budget.get(key)) for key in _LIMITS])
     # A name may be what was typed, as the command has it, in folders of earlier versions.
@@ -341,7 +343,7 @@ def read_run(folder: Path) -> Row:
     stands_in = synthetic and not dataset.startswith("counterpart")
     frames, tested = protocol.get("test_frames"), str(protocol.get("measured", "")).split(" ")[0]
     row = {"folder": folder, "config": config, "stages": stages, "metrics": metrics, "images": images}
-    row |= {"points": points, "plan": plan, "test": test, "measured_at": measured_at}
+    row |= {"points": points, "plan": plan, "test": test, "trust": trust, "measured_at": measured_at}
     row |= {"method": method, "preset": preset, "command": command, "ablation": ablation}
     planned = (row["plan"] or {}).get("overrides") or ()
     row["configuration"] = configuration(config, read_json(folder / "data.json"), planned)

@@ -276,8 +276,9 @@ def film_of(run: Run) -> FilmPath | None:
 
 def trust_degrees(folder: Path) -> float | None:
     """Return the angle beside its film's path to which a run was found to be good; None: not measured."""
-    metrics = read_json(folder / "metrics.json") or {}
-    return metrics.get("trust_degrees")
+    trust = (read_json(folder / "metrics.json") or {}).get("trust")
+    degrees = trust.get("degrees") if isinstance(trust, dict) else None
+    return float(degrees) if is_number(degrees) else None
 
 
 def open_run(
@@ -352,6 +353,7 @@ def scores_to_log(metrics: dict, memory_of: str) -> dict[str, float]:
     """
     kinds, seconds = metrics["test"].items(), metrics["seconds"]
     scores = {f"test/{kind}/{name}": score for kind, of in kinds for name, score in of.items()}
+    scores |= {f"trust/{part}": degrees for part, degrees in metrics.get("trust", {}).items()}
     scores |= {"test/flow/epe_moving": metrics.get("flow", {}).get("epe_moving")}
     scores |= {"test/keypoints/pck_t": metrics.get("keypoints", {}).get("pck_t")}
     scores |= {f"test/seconds_training_{clock}": spent for clock, spent in metrics["clocks"].items()}

@@ -89,13 +89,7 @@ class FilmPath:
 
     def lean(self, camera: Camera, across: float, upward: float) -> Camera:
         """Turn a camera about its pivot by degrees to the right and upwards."""
-        pivot, pose = self.pivot(camera), camera.camera_to_world.clone()
-        right, down = pose[:3, 0], pose[:3, 1]
-        axis = normalize(-across * down - upward * right, dim=0)
-        turn = _rotation(axis, math.radians(math.hypot(across, upward)))
-        pose[:3, :3] = turn @ pose[:3, :3]
-        pose[:3, 3] = pivot + turn @ (camera.center - pivot)
-        return replace(camera, camera_to_world=pose)
+        return leaned(camera, self.pivot(camera), across, upward)
 
     def within(self, camera: Camera, time: float) -> Camera:
         """Bring a camera so near to where the film's was at a time that it is within the trusted angle."""
@@ -133,6 +127,17 @@ class FilmPath:
         places, _ = filmed.project(view.center + depth * rays)
         half = 0.5 * torch.tensor([filmed.width, filmed.height], dtype=torch.float64)
         return float(((places - half).abs() / half).max())
+
+
+def leaned(camera: Camera, pivot: Tensor, across: float, upward: float) -> Camera:
+    """Turn a camera about a pivot (3,) by degrees to the right and upwards."""
+    pose = camera.camera_to_world.clone()
+    right, down = pose[:3, 0], pose[:3, 1]
+    axis = normalize(-across * down - upward * right, dim=0)
+    turn = _rotation(axis, math.radians(math.hypot(across, upward)))
+    pose[:3, :3] = turn @ pose[:3, :3]
+    pose[:3, 3] = pivot + turn @ (camera.center - pivot)
+    return replace(camera, camera_to_world=pose)
 
 
 def _mean(poses: Sequence[Tensor], weights: Sequence[float]) -> Tensor:

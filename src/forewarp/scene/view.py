@@ -21,13 +21,14 @@ _WHOLLY = 0.999  # share of a pixel from which on all of it is valid
 class Moment:
     """A ``time`` in [0, 1] and, if known, the index of the training ``frame`` and the id of the physical
     ``camera`` that took it. ``filmed``: an image is meant that was taken then, with its exposure; else
-    the scene alone.
+    the scene alone. ``lit``: another time, at which that camera had the exposure that is meant.
     """
 
     time: float
     frame: int | None = None
     camera: int | None = None
     filmed: bool = False
+    lit: float | None = None
 
     __repr__ = brief
 

@@ -9,9 +9,11 @@ import torch
 from forewarp.methods.effect import switched
 from forewarp.methods.particles import density
 from forewarp.methods.particles.density import _product, _quaternions, come_to_rest, renew, too_near
+from forewarp.methods.particles.start import at_rest
 from forewarp.methods.rows import take_rows
 from forewarp.ops.gaussians import moved, rotations
-from forewarp.scene.frame import sightings
+from forewarp.ops.grid import dilate
+from forewarp.scene.frame import Frame, sightings
 from tests.support.particles import BARE, EVERY, data_of, look, module_with, small_data
 
 DATA = small_data()
@@ -211,29 +213,48 @@ def test_what_is_beyond_the_box_rests_without_a_node_and_may_be_large():
     assert int(method.skinning.shares[method.resting].count_nonzero()) == 0
 
 
-@pytest.mark.parametrize("share", [0.9, 0.5])
-def test_what_masks_say_rests_in_a_film_follows_no_node(share):
-    """Masks of rest count where most of an image rests; what moves in the images at hand does not."""
+def test_what_masks_say_rests_in_a_film_follows_no_node():
+    """However little of an image rests. Where no mask says what moves, masks of rest count."""
     height, width = DATA.scene.train[0].camera.height, DATA.scene.train[0].camera.width
     moves, rests = torch.zeros(2, height, width, dtype=torch.bool)
-    moves[: height // 2], rests[-round(share * height) :] = True, True
-    masks = {"load_moving": lambda: moves, "load_resting": lambda: rests}
-    scene = replace(DATA.scene, train=tuple(replace(frame, **masks) for frame in DATA.scene.train))
-    data = data_of(scene)
-    assert module_with(data).method.resting is None
-    method = module_with(data, numbers={"rest_by_masks": True}).method
-    assert not switched(method)["background"]
-    cameras = [frame.camera for frame in scene.train]
-    moving, _ = sightings(method.means.data, cameras, [moves] * len(cameras))
-    at_rest, seen = sightings(method.means.data, cameras, [~moves & rests] * len(cameras))
-    assert 0 < int((at_rest == seen).sum()) < len(seen)
-    assert bool(method.resting[at_rest == seen].all()) == (share == 0.9)
-    assert not bool(method.resting[moving == seen].any())
-    assert bool(method.resting.any()) == (share == 0.9)
-    assert int(method.skinning.shares[method.resting].count_nonzero()) == 0
-    scene = replace(scene, train=tuple(replace(frame, load_moving=None) for frame in scene.train))
-    method = module_with(data_of(scene), numbers={"rest_by_masks": True}).method  # nothing is known to move
-    assert bool(method.resting.any()) == (share == 0.9)
+    moves[: round(0.5 * height)], rests[round(0.45 * height) :] = True, True
+    cameras = [frame.camera for frame in DATA.scene.train]
+    for masks in ({"load_moving": lambda: moves}, {"load_resting": lambda: rests}):
+        scene = replace(DATA.scene, train=tuple(replace(frame, **masks) for frame in DATA.scene.train))
+        data = data_of(scene)
+        assert module_with(data).method.resting is None
+        method = module_with(data, numbers={"rest_by_masks": True}).method
+        assert not switched(method)["background"]
+        grown = dilate(moves if "load_moving" in masks else ~rests)
+        moving, seen = sightings(method.means.data, cameras, [grown] * len(cameras))
+        assert 0 < int((moving == 0).sum()) < len(seen)
+        assert bool(method.resting[moving == 0].all())
+        assert not bool(method.resting[(moving == seen) & (seen == len(cameras))].any())
+        assert int(method.skinning.shares[method.resting].count_nonzero()) == 0
+    unknown = module_with(data_of(DATA.scene), numbers={"rest_by_masks": True}).method
+    assert not bool(unknown.resting.any())
+
+
+def test_what_rests_is_told_by_images_in_which_it_is_surface_and_around_the_canonical_time():
+    """A point passes for resting behind what moves before it, but not where it moves around that time."""
+    camera, times = DATA.scene.train[0].camera, [i / 20 for i in range(21)]
+    here, nowhere = (torch.full((camera.height, camera.width), value) for value in (True, False))
+    point = (camera.center + 2.0 * camera.rays(torch.tensor([0])).directions[0]).float()[None]
+
+    def rests(moves, depth=lambda frame: torch.zeros_like(here, dtype=torch.float32)):
+        shots = [
+            Frame("", t, camera, None, load_moving=lambda t=t: here if moves(t) else nowhere) for t in times
+        ]
+        return bool(at_rest(replace(DATA.scene, train=tuple(shots), canonical_time=0.5), point, depth))
+
+    def passing(frame):
+        return torch.full_like(here, 1.0 if frame.time > 0.4 else 2.0, dtype=torch.float32)
+
+    assert rests(lambda time: time > 0.7)
+    assert not rests(lambda time: time < 0.7)
+    assert not rests(lambda time: 0.3 < time < 0.7)  # at fewer times, but then it counts
+    assert rests(lambda time: time > 0.4, passing)
+    assert not rests(lambda time: time < 0.4, passing)
 
 
 @pytest.mark.parametrize(("covered", "least"), [(1e6, 0.02), (100.0, 0.5013)])

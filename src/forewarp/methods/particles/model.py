@@ -16,7 +16,7 @@ from forewarp.fields.moving import GaussiansSnapshot, MovingGaussians, NodeMotio
 from forewarp.losses import IMAGE_LOSSES, robust
 from forewarp.methods.method import Method, Snapshot, Start, Step, value_at
 from forewarp.methods.particles import density, exposure
-from forewarp.methods.particles.contact import set_down
+from forewarp.methods.particles.contact import known_depth, set_down
 from forewarp.methods.particles.follow import follow, put_on_ground
 from forewarp.methods.particles.nodes import Nodes, Skinning, TimeOffsets, are_rows
 from forewarp.methods.particles.options import EFFECTS, SMALLEST, Effects, Numbers, view_share
@@ -51,7 +51,7 @@ class ParticlesSnapshot(GaussiansSnapshot, Snapshot):
     def holds(self, moment: Moment) -> bool:
         """Return whether it is the same time, in the same light."""
         lit = [seen.filmed and seen.camera in self.lit_cameras for seen in (moment, self.moment)]
-        return moment.time == self.moment.time and lit[0] == lit[1]
+        return (moment.time, moment.lit) == (self.moment.time, self.moment.lit) and lit[0] == lit[1]
 
 
 class Particles(Method):
@@ -130,7 +130,7 @@ class Particles(Method):
         may_rest = effects.background is not None or (rests_at_once and effects.motion is not None)
         resting = self.beyond(self.means.data) if may_rest else None
         if may_rest and self.stage.rest_by_masks and not start.blank:
-            resting |= at_rest(start.scene, self.means.data)
+            resting |= at_rest(start.scene, self.means.data, surface_of(start.before))
             if new is not None:
                 resting &= ~new
         self.register_buffer("resting", resting)
@@ -251,7 +251,9 @@ class Particles(Method):
         """
         if not (moment.filmed and moment.camera in self.lit_cameras):
             return None
-        return exposure.gain_and_bias(self.exposure, self._drift(moment.time))
+        return exposure.gain_and_bias(
+            self.exposure, self._drift(moment.time if moment.lit is None else moment.lit)
+        )
 
     def _drift(self, time: float) -> list[float]:
         return exposure.basis_at(len(self.exposure), time, self.shared is not None)
@@ -580,6 +582,22 @@ def _coefficients(before: Tensor | None, *shape: int) -> nn.Parameter | None:
     if shape[1] == 0:
         return None
     return nn.Parameter(before if before is not None and before.shape == shape else torch.zeros(shape))
+
+
+def surface_of(method: Method | None) -> Callable[[Frame], Tensor] | None:
+    """Return what renders how far away the surface is in an image, (H, W), 0 where there is none, from
+    particles of the stage before; None without them.
+    """
+    if not isinstance(method, Particles):
+        return None
+
+    @torch.no_grad()
+    def surface(frame: Frame) -> Tensor:
+        camera = frame.camera
+        drawn = method.at(Moment(frame.time)).render(View(camera), torch.zeros(3, device=method.device))
+        return known_depth(drawn.shaped(camera.height, camera.width))
+
+    return surface
 
 
 def _data(parameter: Tensor | None) -> Tensor | None:

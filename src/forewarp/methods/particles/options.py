@@ -102,8 +102,8 @@ class Numbers:
         rigid_final_factor: factor that the weight of ``rigid`` falls to by the end.
         image_scale: ``[[fraction, times], ...]``: from a fraction on, images are so many times smaller, not
             below 96 pixels of the longer side: motion over many pixels is found in cheap steps.
-        rest_by_masks: whether particles follow no node that rest in the whole film by masks of its images, if
-            it has any and most of an image rests.
+        rest_by_masks: whether particles follow no node that masks of a film's images, if it has any, do not
+            show to move.
         bodies: share of the stage up to which what one camera sees on the ground (by ``rest_by_masks``) moves
             as rigid bodies, and nothing else moves; nodes must rotate. 0: nothing does.
         shell: far planes of the cameras at which particles stand behind all that images show; what is outside

@@ -35,10 +35,12 @@ from forewarp.ops.nodes import carry_nodes, pull_nodes, skin_weights, spread_nod
 from forewarp.scene.box import Box, Lattice
 from forewarp.scene.camera import Camera, Lens, Rays
 from forewarp.scene.cloud import Cloud, nearest
-from forewarp.scene.frame import Frame, Scene, instants_of, sightings, spread, visual_hull
+from forewarp.scene.frame import Frame, Scene, instants_of, spread, visual_hull, where_seen
 
 _FRAMES = 12  # whose silhouettes carve the hull
-_MOSTLY = 0.75  # share of an image's pixels at rest, from which on masks of rest count
+_VOTERS, _AROUND = 30, 8  # images that say what rests: of the whole film, around the canonical time
+_SURFACE = 1.05  # of the depth that an image shows, up to which a point is its surface
+_EDGE = 5e-3  # share of an image's width by which masks of what moves are enlarged
 _DRIFT = 0.2  # share of an image's width by which a silhouette is taken to move in all the time there is
 _ROUGH, _FINE = 48, 112  # voxels along the mean side of the box, and of what is left of it
 _FEW = 16  # points that are too few to begin with
@@ -126,24 +128,46 @@ def hull_surface(scene: Scene, frames: list[int], count: int) -> Cloud | None:
     return Cloud(points, colors, torch.full((count,), 0.5), (area / count) ** 0.5)
 
 
-def at_rest(scene: Scene, points: Tensor) -> Tensor:
+def at_rest(scene: Scene, points: Tensor, surface: Callable[[Frame], Tensor] | None = None) -> Tensor:
     """Tell which points (N, 3) of the canonical state rest in the whole film, by masks of its images: bool.
 
-    None does where masks do not say so of most of an image: what seems to rest there creeps, as clothes do.
-    Else what moves in none of the first images rests, too, where no mask of rest shows it.
+    A point rests unless most of the images in which it is surface show it within masks of what moves: of
+    some that are spread over the film, or of those around the canonical time. Of what is surface in no
+    image, where it lies counts. Where no image says what moves, masks of what rests count; without any, no
+    point rests.
+
+    Args:
+        scene: the film.
+        points: places.
+        surface: returns the depth (H, W) along an image's rays up to which it shows matter, 0: no end; None:
+            nothing hides anything.
+
+    Cost: some 40 masks, and as many depths.
     """
-    rests = torch.zeros(len(points), dtype=torch.bool)
-    near = sorted(scene.train, key=lambda frame: abs(frame.time - scene.canonical_time))[:_FRAMES]
-    known = [frame for frame in near if frame.load_resting is not None]
-    masks = [frame.load_resting() for frame in known]
-    if not masks or sum(float(mask.float().mean()) for mask in masks) < _MOSTLY * len(masks):
-        return rests
-    at_rest, looked = sightings(points, [frame.camera for frame in known], masks)
-    cameras = [frame.camera for frame in near]
-    nowhere = [torch.zeros(camera.height, camera.width, dtype=torch.bool) for camera in cameras]
-    moving = [frame.load_moving() if frame.load_moving else mask for frame, mask in zip(near, nowhere)]
-    moves, seen = sightings(points, cameras, moving)
-    return (seen > 0) & (2 * at_rest >= looked) & (2 * moves <= seen)
+    has_moving = any(frame.load_moving for frame in scene.train)
+    known = [frame for frame in scene.train if (frame.load_moving if has_moving else frame.load_resting)]
+    known.sort(key=lambda frame: frame.time)
+    near = sorted(known, key=lambda frame: abs(frame.time - scene.canonical_time))[:_AROUND]
+    rests = torch.full((len(points),), bool(known))
+    for frames in ([known[i] for i in spread(len(known), _VOTERS)], near):
+        moves, seen, moves_behind, seen_behind = torch.zeros(4, len(points), dtype=torch.int32)
+        for frame in frames:
+            camera = frame.camera
+            row, column, visible = where_seen(camera, points)
+            row, column = row.clamp(0, camera.height - 1), column.clamp(0, camera.width - 1)
+            mask = frame.load_moving() if has_moving else ~frame.load_resting()
+            inside = dilate(mask, max(1, round(_EDGE * camera.width)))[row, column]
+            shown = visible
+            if surface is not None:
+                depth = surface(frame)[row, column]
+                away = (points - camera.center.to(points)).norm(dim=-1)
+                shown = visible & ((away < _SURFACE * depth) | (depth == 0))
+            moves, seen = moves + (shown & inside).int(), seen + shown.int()
+            moves_behind, seen_behind = moves_behind + (visible & inside).int(), seen_behind + visible.int()
+        hidden = seen == 0
+        moves, seen = moves.where(~hidden, moves_behind), seen.where(~hidden, seen_behind)
+        rests &= 2 * moves <= seen
+    return rests
 
 
 def covered_pixels(scene: Scene, frames: list[int]) -> float:
