@@ -121,3 +121,10 @@ def test_khronos_validator_finds_fault_only_with_names_it_does_not_know(particle
     names = {("MESH_PRIMITIVE_INVALID_ATTRIBUTE", attributes), ("UNSUPPORTED_EXTENSION", "/extensionsUsed")}
     assert names <= found
     assert {code for code, _ in found - names} <= {"UNUSED_OBJECT"}
+
+
+def test_a_film_lasts_as_long_as_it_did(particles):
+    film = replace(particles, seconds=2.5)
+    for source, seconds, lasts in ((particles, None, 4.0), (film, None, 2.5), (film, 3.0, 3.0)):
+        _, facts = glb.packed_scene(source, "glb", quality="lossless", seconds=seconds)
+        assert facts["seconds"] == lasts

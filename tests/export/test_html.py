@@ -22,6 +22,7 @@ from forewarp.fields.moving import pinhole_of
 from forewarp.glb import meshopt
 from forewarp.metrics.image import psnr
 from forewarp.scene.camera import Lens, orbit
+from forewarp.scene.film import TRUST_DEGREES
 from forewarp.scene.frame import spread
 from forewarp.scene.view import Moment, View
 from tests.export.conftest import TIMES, exporter
@@ -64,6 +65,10 @@ def test_scripts_and_styles_name_parts_that_there_are():
     named = set(re.findall(r'byId\("([\w-]+)"\)', script)) | set(re.findall(r'click\("([\w-]+)"', script))
     named |= set(re.findall(r"#([a-z]+)\b[^;]*\{", (_PLAYER / "player.css").read_text()))
     assert named <= set(re.findall(r'id="([\w-]+)"', text))
+
+
+def test_page_and_videos_trust_the_same_angle_where_none_was_measured():
+    assert f"const TRUST = {TRUST_DEGREES:g}," in (_PLAYER / "player.js").read_text()
 
 
 def test_a_method_without_particles_is_refused_with_what_it_can_give(ball, tmp_path):
@@ -485,7 +490,7 @@ def test_a_broken_scene_is_told_and_the_picture_stays(browser, particles, tmp_pa
 
 
 @in_browser
-def test_the_view_rides_along_with_one_camera_until_somebody_turns_it(tab_of, particles, tmp_path):
+def test_the_view_rides_along_with_one_camera_leans_and_springs_back(tab_of, particles, tmp_path):
     first, times = particles.cameras[0], torch.linspace(0, 1, 20, dtype=torch.float64)
     path = orbit(first, torch.zeros(3, dtype=torch.float64), torch.tensor([0.0, 0, 1]).double(), 0.2 * times)
     times = times.tolist()
@@ -499,12 +504,32 @@ def test_the_view_rides_along_with_one_camera_until_somebody_turns_it(tab_of, pa
         np.testing.assert_allclose(state(tab, "eye")[0], camera.center, atol=0.02)
         np.testing.assert_allclose(state(tab, "ahead")[0], camera.camera_to_world[:3, 2], atol=0.02)
         np.testing.assert_allclose(state(tab, "down")[0], camera.camera_to_world[:3, 1], atol=0.02)
+    beside = "beside() * 180 / Math.PI"
+    tab.page.mouse.move(160, 160)
+    tab.page.mouse.down()
+    tab.page.mouse.move(310, 40, steps=3)
+    assert 7 < state(tab, beside)[0] < 8.001
+    tab.page.mouse.up()
+    until(lambda: state(tab, beside)[0] < 0.05)
     tab.page.keyboard.press("ArrowLeft")
-    eye = state(tab, "eye")[0]
-    tab.page.keyboard.press(",")
-    assert state(tab, "riding", "eye") == [False, eye]
+    assert 1 < state(tab, beside)[0] < 8.001
+    until(lambda: state(tab, beside)[0] < 0.05)
+    assert state(tab, "riding") == [True]
+    tab.page.mouse.move(160, 160)
+    tab.page.mouse.wheel(0, -300)
+    until(lambda: state(tab, "zoom > 1")[0])
+    assert state(tab, beside)[0] < 0.05
     tab.page.keyboard.press("r")
+    for _ in range(4):
+        tab.page.keyboard.press("ArrowLeft")
+    tab.page.evaluate(SETTLED)
+    assert state(tab, "riding", f"{beside} > 10") == [False, True]
+    assert tab.page.get_by_text("beside the film, which shows up to 8°").is_visible()
+    eye = state(tab, "eye")[0]
+    tab.page.keyboard.press("r")
+    tab.page.evaluate(SETTLED)
     assert state(tab, "riding", "eye") != [True, eye]
+    assert not tab.page.locator("#edge").is_visible()
     go(tab, file, "?t=0.5&camera=3")
     assert state(tab, "riding") == [False]
     export(replace(source, image_times=[(7 * i % 20) / 19 for i in range(20)]), tmp_path / "html")

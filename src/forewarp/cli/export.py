@@ -23,7 +23,7 @@ What one types most:
   files=ply|obj                 mesh: the files
   points=N                      gltf, npz: most points
   quality=compact|lossless      glb, html: rounded to what an eye can tell, or in float32
-  seconds=N                     glb, usd, gltf, html: how long the animation lasts
+  seconds=N                     glb, usd, gltf, html: how long the animation lasts (as the film, else 4)
   views=N                       npz: cameras that tell which points are visible
   trust=[PACKAGE]               code of other packages that the run's config may name
   data.root=FOLDER              where the data are now, if they moved
@@ -91,7 +91,9 @@ def source_of(run, module, model: str, times: list[float]):
     cameras, taken = [frame.camera for frame in scene.train], [frame.time for frame in scene.train]
     background = tuple(run.datamodule.targets("train").background.tolist())
     place = tuple(scene.protocol.get("span", (0.0, 1.0))), scene.protocol.get("window", [0.0])[0]
-    more = {"world": scene.world, "trust": trust_degrees(Path(run.folder))}
+    seconds = scene.protocol.get("seconds")
+    seconds = seconds and seconds / (place[0][1] - place[0][0])  # of all windows, where it is one
+    more = {"world": scene.world, "trust": trust_degrees(Path(run.folder)), "seconds": seconds}
     return Source(module, model, cameras, times, background, scene.name, taken, *place, **more)
 
 

@@ -71,6 +71,8 @@ def check_option(key: str, value: object) -> None:
     Raises:
         ValueError: naming the values that it can have.
     """
+    if value is None and key == "seconds":
+        return
     if key in CHOICES:
         choices = CHOICES[key]
         good = type(value) is type(choices[0]) and value in choices

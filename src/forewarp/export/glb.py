@@ -19,12 +19,14 @@ from forewarp.scene.camera import focus_point
 from forewarp.scene.frame import Frame, spread
 from forewarp.scene.view import Moment
 
-_CAMERAS = 12  # of training, beside the first one
+_CAMERAS, _OF_FILM = 12, 64  # of training, beside the first one; of a film, along which players ride
 # Pixels, and share of an image: who makes up less than the smaller of these of any image is not missed.
 _LEAST_PIXELS, _LEAST_SHARE = 0.25, 1.5e-6
 
 
-def export_glb(source: Source, folder: Path, progress: Progress, *, quality: str, seconds: float) -> dict:
+def export_glb(
+    source: Source, folder: Path, progress: Progress, *, quality: str, seconds: float | None
+) -> dict:
     """Write ``scene.glb``.
 
     Args:
@@ -46,7 +48,7 @@ def export_glb(source: Source, folder: Path, progress: Progress, *, quality: str
 
 
 def packed_scene(
-    source: Source, kind: str, progress: Progress = no_progress, *, quality: str, seconds: float
+    source: Source, kind: str, progress: Progress = no_progress, *, quality: str, seconds: float | None
 ) -> tuple[bytes, dict]:
     """Return the content of ``scene.glb``, and facts about it.
 
@@ -55,7 +57,7 @@ def packed_scene(
         kind: the format that needs it.
         progress: called after each image that is looked at.
         quality: ``compact`` or ``lossless``.
-        seconds: how long a player takes from time 0 to time 1.
+        seconds: how long a player takes from time 0 to time 1; None: see ``Source.lasts``.
 
     Raises:
         ValueError: for a method without particles, naming the formats that it has; where nothing is seen.
@@ -83,7 +85,8 @@ def packed_scene(
     cameras = [world.camera_to_data(camera) for window, world in places for camera in window.cameras]
     ends = [(window.image_times, *window.span) for window in windows]
     times = [first + time * (last - first) for taken, first, last in ends for time in taken]
-    numbers = sorted({0, *spread(len(cameras), _CAMERAS)})
+    numbers = sorted({0, *spread(len(cameras), _OF_FILM if source.is_film else _CAMERAS)})
+    seconds = source.lasts if seconds is None else seconds
     shown, taken = [cameras[n] for n in numbers], [times[n] for n in numbers] if times else []
     rotation, focus = source.rotation_to("y"), focus_point(cameras)
     setting = Setting(

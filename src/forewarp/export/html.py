@@ -26,7 +26,9 @@ _POLICY = (
 )
 
 
-def export_html(source: Source, folder: Path, progress: Progress, *, quality: str, seconds: float) -> dict:
+def export_html(
+    source: Source, folder: Path, progress: Progress, *, quality: str, seconds: float | None
+) -> dict:
     """Write ``scene.html``.
 
     Args:
@@ -34,7 +36,7 @@ def export_html(source: Source, folder: Path, progress: Progress, *, quality: st
         folder: to write into.
         progress: called once.
         quality: of the scene in it, see ``packed_scene``.
-        seconds: how long the page takes from time 0 to time 1.
+        seconds: how long the page takes from time 0 to time 1; None: see ``Source.lasts``.
 
     Returns:
         the facts for ``about.json``.
@@ -48,22 +50,33 @@ def export_html(source: Source, folder: Path, progress: Progress, *, quality: st
     return facts
 
 
-def player_of(source: Source, *, quality: str = "compact", seconds: float = 4.0) -> tuple[str, dict]:
+def player_of(source: Source, *, quality: str = "compact", seconds: float | None = None) -> tuple[str, dict]:
     """Return the page of a scene, and the facts; see ``export_html``."""
     content, facts = packed_scene(source, "html", quality=quality, seconds=seconds)
-    text = page(content, title=source.name, poster=poster(source), background=source.background)
+    look = {"title": source.name, "poster": poster(source), "background": source.background}
+    text = page(content, **look, framed=source.is_film)
     return text, facts
 
 
 @torch.no_grad()
 def poster(source: Source) -> Tensor:
-    """Render what the page begins with: the first camera's image (H, W, 3) at time 0."""
-    camera = source.cameras[0]
+    """Render what the page begins with: the first camera's image (H, W, 3) at time 0; of a film the camera
+    that was there then.
+    """
+    first = min(range(len(source.cameras)), key=source.image_times.__getitem__) if source.is_film else 0
+    camera = source.cameras[first]
     image = source.method.at(Moment(0.0)).render(View(camera), torch.tensor(source.background))
     return image.shaped(camera.height, camera.width).rgb
 
 
-def page(content: bytes, *, title: str, poster: Tensor, background: tuple[float, float, float]) -> str:
+def page(
+    content: bytes,
+    *,
+    title: str,
+    poster: Tensor,
+    background: tuple[float, float, float],
+    framed: bool = False,
+) -> str:
     """Return a page that plays a scene.
 
     Args:
@@ -71,6 +84,7 @@ def page(content: bytes, *, title: str, poster: Tensor, background: tuple[float,
         title: any text.
         poster: (H, W, 3) in [0, 1], shown until the scene runs, and where it cannot.
         background: behind the poster, sRGB in [0, 1].
+        framed: it is a film, which is shown in its frame.
     """
     side, quality = _POSTER
     deflate = zlib.compressobj(9, zlib.DEFLATED, -zlib.MAX_WBITS)
@@ -80,6 +94,8 @@ def page(content: bytes, *, title: str, poster: Tensor, background: tuple[float,
         "title": html.escape(title),
         "style": _source("player.css"),
         "background": "rgb({:.0f} {:.0f} {:.0f})".format(*(255 * part for part in background)),
+        "framed": ' class="framed"' * framed,
+        "shape": f"{poster.shape[1] / poster.shape[0]:.4f}",
         "poster": "data:image/jpeg;base64," + _base64(jpeg_bytes(at_most(poster, side), quality)),
         "scene": _base64(deflate.compress(content) + deflate.flush()),
         "motion": motion,

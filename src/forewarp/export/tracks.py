@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +22,7 @@ from forewarp.glb.container import UINT, Buffer, quaternion_of
 from forewarp.methods.method import HasBounds, HasEllipsoids, HasMatter, HasTrajectories, Method
 from forewarp.scene.camera import Camera, mean_up
 from forewarp.scene.cloud import far_apart
+from forewarp.scene.film import FilmPath
 from forewarp.scene.frame import spread
 from forewarp.scene.view import Moment, View
 from forewarp.scene.world import SAME, World
@@ -31,6 +33,7 @@ Progress = Callable[[int, int], None]  # the number of times done, and of how ma
 _UP = {"y": (0.0, 1.0, 0.0), "-y": (0.0, -1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 _MIN_OPACITY = 0.1  # a particle that never gets as opaque is no point of the surface
 _VIEW_SIZE = 200  # most pixels per side of the images that decide what is hidden
+_SECONDS = 4.0  # that an animation of other scenes than films lasts
 _SLACK = 1.5  # sizes of a point that it may lie behind the surface and still count as visible
 
 
@@ -45,7 +48,8 @@ class Source:
     ``image_times``, when each camera took its image. Of a film in windows it is the first one, whose time 0
     and 1 are those of the film in ``span``; ``later`` are the others, each shown from its ``begin`` on.
     ``world`` is where all of this lies in the world of the data. ``trust``: the angle, degrees, up to which
-    its images are good beside the path of the cameras, if the run was measured.
+    its images are good beside the path of the cameras, if the run was measured; ``seconds``:
+    how long the film lasts, where that is known.
     """
 
     module: DynamicSceneModule
@@ -60,11 +64,23 @@ class Source:
     later: Sequence[Source] = ()
     world: World = SAME
     trust: float | None = None
+    seconds: float | None = None
 
     @property
     def method(self) -> Method:
         """The fitted method."""
         return self.module.method
+
+    @property
+    def lasts(self) -> float:
+        """How many seconds an animation of it lasts, unless told otherwise: as long as the film, or 4."""
+        return self.seconds or _SECONDS
+
+    @cached_property
+    def is_film(self) -> bool:
+        """Whether one camera filmed it, going smoothly from image to image."""
+        known = len(self.image_times) == len(self.cameras)
+        return known and FilmPath.of(self.cameras, self.image_times) is not None
 
     @property
     def shift(self) -> tuple[float, float, float]:
@@ -252,7 +268,9 @@ _NEIGHBOUR, _RADIUS = 4, 0.8
 _MIN_COLOR_CHANGE = 1 / 255
 
 
-def export_gltf(source: Source, folder: Path, progress: Progress, *, points: int, seconds: float) -> dict:
+def export_gltf(
+    source: Source, folder: Path, progress: Progress, *, points: int, seconds: float | None
+) -> dict:
     """Write ``points.glb``.
 
     Args:
@@ -260,13 +278,14 @@ def export_gltf(source: Source, folder: Path, progress: Progress, *, points: int
         folder: to write into.
         progress: called after each time.
         points: most points.
-        seconds: duration of the animation from time 0 to time 1.
+        seconds: duration of the animation from time 0 to time 1; None: see ``Source.lasts``.
 
     Returns:
         the facts for ``about.json``.
     """
     tracks = tracks_of(source, points, progress).in_data(source.in_files)
     radius = _RADIUS * neighbour_distance(tracks.points, tracks.size)
+    seconds = source.lasts if seconds is None else seconds
     (folder / "points.glb").write_bytes(glb(tracks, radius, source.rotation_to("y"), seconds, source.shift))
     axes = "y up, by the turn of its only node; places before it are the data's"
     facts = {"points": len(tracks), "radius": radius, "seconds": seconds, "axes in the file": axes}

@@ -21,7 +21,7 @@ _REACH = 3.0  # standard deviations that the extent holds
 
 
 def export_usd(
-    source: Source, folder: Path, progress: Progress, *, degree: int, up: str, seconds: float
+    source: Source, folder: Path, progress: Progress, *, degree: int, up: str, seconds: float | None
 ) -> dict:
     """Write ``scene.usdc``: one prim, whose attributes that change have a sample at each time, between which
     readers interpolate linearly.
@@ -33,7 +33,7 @@ def export_usd(
         degree: of the spherical harmonics, at most that of the run.
         up: the axis that points upwards, ``y`` or ``z``; ``world``: that of the two along which the data's
             own world is upright, else z.
-        seconds: duration from time 0 to time 1.
+        seconds: duration from time 0 to time 1; None: see ``Source.lasts``.
 
     Returns:
         the facts for ``about.json``.
@@ -59,6 +59,7 @@ def export_usd(
     for before, cloud in zip(clouds, clouds[1:]):  # the shorter way round
         flips = (before["orientations"] * cloud["orientations"]).sum(-1, keepdims=True) < 0
         cloud["orientations"] = np.where(flips, -1, 1).astype(np.float32) * cloud["orientations"]
+    seconds = source.lasts if seconds is None else seconds
     codes = [time * seconds * _FPS for time in source.times]
 
     file = folder / "scene.usdc"

@@ -4,6 +4,7 @@
 const ROW = 1024; // particles in a row of a texture
 const BORDER = 15; // steps along a side of an image
 const NODES = 256; // nodes in a row of their texture
+const SMALL = 64; // pixels of a side of the blurred image that fills holes
 const LAYERS = ["all", "moving", "resting"];
 
 const PROJECT = `
@@ -168,13 +169,33 @@ void main() { gl_Position = vec4(4 * (gl_VertexID & 1) - 1, 2 * (gl_VertexID & 2
 
 const OVER_FRAGMENT = `
 uniform highp sampler2D target;
+uniform highp sampler2D small;
 uniform vec3 background;
-uniform int height;
+uniform vec2 size;
+uniform bool fills;
 out vec4 drawn;
 void main() {
-  ivec2 cell = ivec2(gl_FragCoord.xy); // rows of the target run from the top
-  vec4 seen = texelFetch(target, ivec2(cell.x, height - 1 - cell.y), 0);
+  vec2 at = vec2(gl_FragCoord.x, size.y - gl_FragCoord.y); // rows of the target run from the top
+  vec4 seen = texelFetch(target, ivec2(at), 0);
+  if (fills && seen.a < 0.996) {
+    // Holes of an image that else is full get the colours around them, nearest first.
+    float full = smoothstep(0.6, 0.8, textureLod(small, vec2(0.5), SMALLEST).a);
+    for (float k = 0.0; k <= SMALLEST; k++) seen += full * (1.0 - seen.a) * textureLod(small, at / size, k);
+  }
   drawn = vec4(seen.rgb + (1.0 - seen.a) * background, 1);
+}`;
+
+const SMALL_FRAGMENT = `
+uniform highp sampler2D target;
+uniform vec2 size;
+out vec4 drawn;
+void main() {
+  vec4 sum = vec4(0);
+  for (int k = 0; k < 64; k++) {
+    vec2 at = (gl_FragCoord.xy - 0.5 + (vec2(k % 8, k / 8) + 0.5) / 8.0) / SMALL;
+    sum += texelFetch(target, ivec2(at * size), 0) / 64.0;
+  }
+  drawn = sum;
 }`;
 
 const TRAIL_VERTEX = `
@@ -218,9 +239,9 @@ void main() {
   drawn = vec4(alpha * shade.rgb, alpha);
 }`;
 
-// Return what a camera's lens is for an image of another size, in which its own is wholly seen.
-function fitted(lens, width, height) {
-  const scale = Math.min(width / lens.width, height / lens.height);
+// Return what a camera's lens is for an image of another size, in which its own is wholly seen; or which it fills.
+function fitted(lens, width, height, fills = false) {
+  const sides = [width / lens.width, height / lens.height], scale = fills ? Math.max(...sides) : Math.min(...sides);
   return {
     focal: [lens.fx * scale, lens.fy * scale],
     middle: [
@@ -306,12 +327,13 @@ class Renderer {
     const defines = {
       ROW, NODES, LINKS: links, DEGREE: degree, COLORS: colors, OPACITIES: opacities,
       TIMES: Math.max(colors, opacities, 1), FIRST_HARMONIC: harmonics, FIRST_TIME: times,
-      LOG_255: Math.log(255),
+      LOG_255: Math.log(255), SMALL: `${SMALL}.0`, SMALLEST: `${Math.log2(SMALL)}.0`,
     };
     this.times = Math.max(colors, opacities);
     this.project = this.program(WHOLE_VERTEX, PROJECT, defines);
     this.splat = this.program(SPLAT_VERTEX, SPLAT_FRAGMENT, defines);
     this.over = this.program(WHOLE_VERTEX, OVER_FRAGMENT, defines);
+    this.shrink = this.program(WHOLE_VERTEX, SMALL_FRAGMENT, defines);
     this.trail = this.program(TRAIL_VERTEX, TRAIL_FRAGMENT, defines);
     this.fillParticles(rows, times + this.times);
     const nodes = scene.nodes?.count ?? 1; // every sampler has a texture of its kind
@@ -326,6 +348,11 @@ class Renderer {
     });
     this.projected = this.framebuffer(this.splats);
     this.rows = rows;
+    this.small = this.texture(gl.TEXTURE_2D);
+    gl.texStorage2D(gl.TEXTURE_2D, Math.log2(SMALL) + 1, this.bits > 8 ? gl.RGBA16F : gl.RGBA8, SMALL, SMALL);
+    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.LINEAR_MIPMAP_LINEAR);
+    gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MAG_FILTER, gl.LINEAR);
+    this.shrunk = this.framebuffer([this.small]);
     this.target = null;
     this.order = this.texture(gl.TEXTURE_2D);
     gl.texStorage2D(gl.TEXTURE_2D, 1, gl.R32UI, ROW, rows);
@@ -487,15 +514,27 @@ class Renderer {
   }
 
   // Draw the target, and trails where there are any, onto the canvas, which has its size; by a share of less
-  // than 1 over what is there.
-  drawCanvas(view, background, trailWidth = 0, share = 1) {
-    const { gl, over } = this;
+  // than 1 over what is there. ``fills``: holes get the colours around them.
+  drawCanvas(view, background, fills = false, trailWidth = 0, share = 1) {
+    const { gl, over, shrink } = this;
+    if (fills) {
+      gl.bindFramebuffer(gl.FRAMEBUFFER, this.shrunk);
+      gl.viewport(0, 0, SMALL, SMALL);
+      gl.useProgram(shrink.program);
+      this.bind(shrink, "target", 0, this.target.texture);
+      gl.uniform2fv(shrink.place("size"), view.size);
+      gl.drawArrays(gl.TRIANGLES, 0, 3);
+      gl.bindTexture(gl.TEXTURE_2D, this.small);
+      gl.generateMipmap(gl.TEXTURE_2D);
+    }
     gl.bindFramebuffer(gl.FRAMEBUFFER, null);
     gl.viewport(0, 0, ...view.size);
     gl.useProgram(over.program);
     this.bind(over, "target", 0, this.target.texture);
     gl.uniform3fv(over.place("background"), background);
-    gl.uniform1i(over.place("height"), view.size[1]);
+    this.bind(over, "small", 1, this.small);
+    gl.uniform2fv(over.place("size"), view.size);
+    gl.uniform1i(over.place("fills"), fills);
     if (share < 1) gl.enable(gl.BLEND);
     gl.blendColor(0, 0, 0, share);
     gl.blendFunc(gl.CONSTANT_ALPHA, gl.ONE_MINUS_CONSTANT_ALPHA);

@@ -223,7 +223,7 @@ function readScene(bytes) {
   const matrices = globalMatrices(gltf.nodes), turn = matrices[mesh];
   const setting = {
     seconds: motion.seconds ?? 4, background: motion.background ?? [1, 1, 1],
-    focus: motion.focus ?? [0, 0, 0], margin: motion.margin ?? 0.125,
+    focus: motion.focus ?? [0, 0, 0], trust: gltf.nodes[mesh].extras?.trust_degrees, margin: motion.margin ?? 0.125,
     up: [turn[1], turn[5], turn[9]], cameras: camerasOf(gltf, matrices, turn),
   };
   const first = readParticles(primitive, gltf, read), { shared = 0, fade = 0, list = [{}] } = motion.windows ?? {};

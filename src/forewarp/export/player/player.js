@@ -5,6 +5,10 @@ const SCALES = [1, 0.75, 0.55, 0.4, 0.3]; // of the canvas's pixels, while somet
 const SLOW = 45, QUICK = 24; // milliseconds between frames from which on pictures become smaller, or larger
 const QUIET = 2800; // milliseconds after which the controls fade while the scene plays
 const STEADY = Math.cos(0.5), STEP = 0.5; // between cameras of a path: least cosine, most of the distance
+const TRUST = 8, LEAST_TRUST = 2; // degrees beside a film's path: of files that do not say it; that are always let
+const SPRING = 260, HOLD = 700; // milliseconds in which a lean goes back, mostly; after which one by keys does
+const LEAN_CROP = 0.12; // by how much the frame narrows at the edge of what is trusted
+const MOST_ZOOM = 4; // of a film's frame
 const BEHIND = { dark: [0.055, 0.059, 0.071], light: [1, 1, 1] };
 
 const byId = (id) => document.getElementById(id);
@@ -125,6 +129,9 @@ class Player {
     Object.assign(this, this.windows[0]);
     this.shown = [[this.windows[0], 1]];
     this.path = pathOf(this.scene);
+    this.trust = (Math.max(this.scene.trust ?? TRUST, LEAST_TRUST) * Math.PI) / 180;
+    this.held = false;
+    document.body.classList.toggle("framed", this.path !== null);
     this.home();
   }
 
@@ -158,11 +165,45 @@ class Player {
     this.ride(this.path !== null);
   }
 
-  // Go along with the camera that took the images, until somebody turns or shifts the view.
+  // Go along with the camera that took the images: a drag leans the view within the angle that is trusted, and
+  // it springs back. Else fly freely.
   ride(on) {
     this.riding = on && this.path !== null;
-    byId("ride").setAttribute("aria-pressed", this.riding);
-    if (this.riding) this.stand(poseOn(this.path, this.time));
+    this.pull = [0, 0]; // by how much the view was dragged, angles to the left and upwards
+    this.zoom = 1;
+    this.pan = [0, 0]; // of what the zoom cuts off, -1 to 1
+    byId("free").setAttribute("aria-pressed", !this.riding);
+    if (!this.riding) return;
+    this.lens = this.path[0].lens;
+    this.follow();
+  }
+
+  // Stand where the film's camera was at this time, leant aside.
+  follow() {
+    this.stand(poseOn(this.path, this.time));
+    const pulled = Math.hypot(...this.pull), angle = this.trust * Math.tanh(pulled / this.trust);
+    this.leant = angle / this.trust;
+    if (!pulled) return;
+    const target = add(this.eye, this.ahead, this.away), [left, upward] = unit([...this.pull]);
+    const axis = unit(add(this.down.map((value) => -left * value), this.right, upward));
+    for (const name of ["right", "down", "ahead"]) this[name] = unit(turned(this[name], axis, angle));
+    this.eye = add(target, this.ahead, -this.away);
+  }
+
+  // Return the angle between the view and the film's camera of this time, seen from what that one looks at.
+  beside() {
+    const { eye, ahead } = poseOn(this.path, this.time), { focus } = this.scene;
+    const target = add(eye, ahead, Math.max(dot(add(focus, eye, -1), ahead), 2 * this.lens.near));
+    return Math.acos(clamp(dot(unit(add(this.eye, target, -1)), unit(add(eye, target, -1))), -1, 1));
+  }
+
+  // Show how far the view is beyond what is trusted, where somebody flies freely.
+  showEdge() {
+    const angle = this.path && !this.riding ? this.beside() : 0, degrees = (a) => `${Math.round((a * 180) / Math.PI)}°`;
+    const beyond = clamp(angle / this.trust - 1, 0, 1);
+    byId("edge").hidden = !beyond;
+    byId("edge").style.opacity = 0.4 + 0.6 * beyond;
+    byId("edge-text").textContent = `${degrees(angle)} beside the film, which shows up to ${degrees(this.trust)}`;
   }
 
   // Look through a camera of the file.
@@ -191,7 +232,7 @@ class Player {
   setTime(time) {
     this.time = clamp(time, 0, 1);
     this.enter();
-    if (this.riding) this.stand(poseOn(this.path, this.time));
+    if (this.riding) this.follow();
     this.untimed = this.stale = this.unsorted = true;
     this.changed = performance.now();
     this.wake();
@@ -199,7 +240,12 @@ class Player {
 
   // Turn about the point that the camera looks at, by angles to the left and upwards.
   turn(left, upward) {
-    this.ride(false);
+    if (this.riding) {
+      this.pull = add(this.pull, [left, upward]);
+      this.released = performance.now() + HOLD;
+      if (!this.held) setTimeout(() => this.wake(), HOLD);
+      return this.follow();
+    }
     const { right, scene: { up } } = this, target = add(this.eye, this.ahead, this.away);
     const height = Math.asin(clamp(dot(this.ahead, up), -1, 1));
     const lift = clamp(height + upward, -1.5, 1.5) - height;
@@ -212,7 +258,12 @@ class Player {
 
   // Shift what is seen by CSS pixels.
   shift(dx, dy) {
-    this.ride(false);
+    if (this.riding) {
+      const { clientWidth, clientHeight } = this.canvas, room = Math.max(this.zoom - 1, 1e-3);
+      const moved = [(2 * dx) / (clientWidth * room), (2 * dy) / (clientHeight * room)];
+      this.pan = add(this.pan, moved).map((value) => clamp(value, -1, 1));
+      return this.changeView();
+    }
     const { focal } = fitted(this.lens, this.canvas.clientWidth, this.canvas.clientHeight);
     this.eye = add(this.eye, this.right, (-dx * this.away) / focal[0]);
     this.eye = add(this.eye, this.down, (-dy * this.away) / focal[1]);
@@ -221,7 +272,10 @@ class Player {
 
   // Go nearer by a factor below 1, or farther.
   approach(factor) {
-    this.ride(false);
+    if (this.riding) {
+      this.zoom = clamp(this.zoom / factor, 1, MOST_ZOOM);
+      return this.changeView();
+    }
     const target = add(this.eye, this.ahead, this.away);
     this.away = Math.max(this.away * factor, 2 * this.lens.near);
     this.eye = add(target, this.ahead, -this.away);
@@ -264,7 +318,16 @@ class Player {
 
   view(width, height) {
     const { eye, right, down, ahead } = this;
-    return { eye, right, down, ahead, ...fitted(this.lens, width, height) };
+    const view = { eye, right, down, ahead, ...fitted(this.lens, width, height, this.path !== null) };
+    if (!this.riding) return view;
+    const scale = this.zoom * (1 + LEAN_CROP * this.leant ** 2);
+    view.focal = view.focal.map((value) => scale * value);
+    view.skew *= scale;
+    view.middle = view.middle.map((value, i) => {
+      const half = view.size[i] / 2;
+      return half + scale * (value - half) + this.pan[i] * (this.zoom - 1) * half;
+    });
+    return view;
   }
 
   wake() {
@@ -287,6 +350,7 @@ class Player {
     const quiet = performance.now() - this.touched > QUIET && byId("panel").hidden;
     if (this.playing && quiet) document.body.classList.add("idle");
     this.adapt(lively);
+    this.springBack(gap);
     if (this.untimed) {
       for (const [{ renderer }] of this.shown) renderer.setTime(this.time);
       this.showTime();
@@ -298,6 +362,14 @@ class Player {
     this.last = lively ? now : 0;
     if (lively || this.stale) this.wake();
     if (this.playing || !(lively || this.stale || this.sorting.busy)) this.waiting.splice(0).forEach((tell) => tell());
+  }
+
+  // Let go of a lean that nobody holds any more.
+  springBack(gap) {
+    if (!this.riding || this.held || !Math.hypot(...this.pull) || performance.now() < this.released) return;
+    const pull = this.pull.map((value) => clamp(value, -2 * this.trust, 2 * this.trust) * Math.exp(-Math.min(gap || 16, 400) / SPRING));
+    this.pull = Math.hypot(...pull) > 1e-3 * this.trust ? pull : [0, 0];
+    this.follow();
   }
 
   // Make pictures smaller while they come too slowly, and larger once they would not.
@@ -318,10 +390,11 @@ class Player {
       this.canvas.height = height;
     }
     const view = this.view(width, height), trail = this.trails ? Math.max((1.6 * width) / this.canvas.clientWidth, 1) : 0;
-    const [[part, share], [other] = []] = this.shown;
+    const [[part, share], [other] = []] = this.shown, fills = this.path !== null && this.behind === "own" && this.layer !== "moving";
     for (const { renderer } of other ? [other, part] : [part]) renderer.drawTarget(view, this.layer);
-    if (other) other.renderer.drawCanvas(view, this.background());
-    part.renderer.drawCanvas(view, this.background(), trail, share);
+    if (other) other.renderer.drawCanvas(view, this.background(), fills);
+    part.renderer.drawCanvas(view, this.background(), fills, trail, share);
+    this.showEdge();
     if (scale !== 1) this.stale = true; // once more, sharply, when nothing moves any more
   }
 
@@ -361,8 +434,8 @@ class Player {
     this.wake();
   }
 
-  // Follow the address: ?t=0.5&autoplay=1&camera=3, or the same after #.
-  follow(reduced) {
+  // Take the address: ?t=0.5&autoplay=1&camera=3, or the same after #.
+  obey(reduced) {
     const asked = new URLSearchParams(location.search);
     new URLSearchParams(location.hash.slice(1)).forEach((value, key) => asked.set(key, value));
     const number = (key) => (asked.has(key) && asked.get(key).trim() !== "" ? Number(asked.get(key)) : NaN);
@@ -390,7 +463,7 @@ class Player {
 function connect(player) {
   const { canvas } = player, panel = byId("panel"), keys = byId("keys");
   const click = (id, action) => byId(id).addEventListener("click", action);
-  const home = () => player.home(), next = () => player.look((player.camera + 1) % player.scene.cameras.length);
+  const home = () => player.home(), next = () => byId("camera").hidden || player.look((player.camera + 1) % player.scene.cameras.length);
   const toggleHelp = () => {
     const { count, inMotion } = player.scene, { bits } = player.renderer;
     const sorted = player.sorting.milliseconds.toFixed(1);
@@ -408,9 +481,9 @@ function connect(player) {
     else document.documentElement.requestFullscreen?.();
   };
   byId("whole").hidden = !document.fullscreenEnabled;
-  byId("ride").hidden = !player.path;
+  byId("free").hidden = !player.path;
   for (const row of document.querySelectorAll("[data-of]")) row.hidden = byId(row.dataset.of).hidden;
-  byId("camera").hidden = player.scene.cameras.length < 2;
+  byId("camera").hidden = player.scene.cameras.length < 2 || player.path !== null;
   byId("layers").hidden = !player.scene.inMotion || player.scene.inMotion === player.scene.count;
   for (const name of ["play", "time", "clock", "trails"]) byId(name).disabled = !player.moves();
   click("play", () => player.play(!player.playing));
@@ -419,7 +492,7 @@ function connect(player) {
   click("more", () => togglePanel());
   click("trails", () => player.setTrails(!player.trails));
   click("camera", next);
-  click("ride", () => player.ride(!player.riding));
+  click("free", () => player.ride(!player.riding));
   click("help", toggleHelp);
   byId("time").addEventListener("input", ({ target }) => {
     player.play(false);
@@ -434,7 +507,7 @@ function connect(player) {
   const actions = {
     " ": () => player.play(!player.playing), h: home, c: next, f: toggleWhole, v: () => togglePanel(), "?": toggleHelp,
     l: () => player.choose("loop"), b: () => player.choose("behind"), t: () => player.setTrails(!player.trails),
-    r: () => player.ride(!player.riding), m: () => byId("layers").hidden || player.choose("layer"), "+": () => player.approach(0.9), "=": () => player.approach(0.9),
+    r: () => player.path && player.ride(!player.riding), m: () => byId("layers").hidden || player.choose("layer"), "+": () => player.approach(0.9), "=": () => player.approach(0.9),
     "-": () => player.approach(1 / 0.9), ",": () => step(-1), ".": () => step(1),
     "[": () => speedUp(-1), "]": () => speedUp(1), escape: () => togglePanel(false),
   };
@@ -473,6 +546,7 @@ function connect(player) {
   };
   canvas.addEventListener("pointerdown", (event) => {
     canvas.setPointerCapture(event.pointerId);
+    player.held = true;
     canvas.classList.add("held");
     pointers.set(event.pointerId, { x: event.clientX, y: event.clientY, shifts: event.button === 2 || event.shiftKey });
   });
@@ -493,6 +567,9 @@ function connect(player) {
   for (const name of ["pointerup", "pointercancel"]) {
     canvas.addEventListener(name, (event) => {
       pointers.delete(event.pointerId);
+      player.held = pointers.size > 0;
+      player.released = 0;
+      player.wake();
       canvas.classList.toggle("held", pointers.size > 0);
     });
   }
@@ -580,7 +657,7 @@ function doorOf(player) {
       }
       const seconds = (performance.now() - begin) / 1000, mean = (of) => of.reduce((a, b) => a + b, 0) / of.length;
       player.measured = false;
-      player.look(player.camera);
+      player.home();
       return {
         particles: scene.count, width, height, "frames a second": frames / seconds,
         "ms of sorting, in the worker": mean(sorts), "ms of the page's own code a frame": busy / frames,
@@ -612,8 +689,8 @@ async function main() {
     connect(player);
     player.renderer.setTime(0);
     player.renderer.setOrder(new Sorter(player.scene).sorted(player.renderer.maps, player.eye));
-    player.follow(quiet.matches);
-    addEventListener("hashchange", () => player.follow(quiet.matches));
+    player.obey(quiet.matches);
+    addEventListener("hashchange", () => player.obey(quiet.matches));
     quiet.addEventListener("change", () => quiet.matches && player.play(false));
     player.paint(false);
     byId("poster").remove();
