@@ -240,7 +240,7 @@ def small_dome(folder):
 
 
 def video(folder):
-    written.write_video(folder, times=[i / 9 for i in range(10)], channels=4)
+    written.write_video(folder, times=[i / 5 for i in range(6)], channels=4)
 
 
 def films(folder):

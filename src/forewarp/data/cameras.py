@@ -102,8 +102,8 @@ def frustum_box(cameras: Iterable[Camera]) -> Box:
     points = []
     for camera in cameras:
         # Corners are not enough: at equal length a ray through the middle of an edge reaches further.
-        rays = camera.rays(nine_pixels(camera), dtype=torch.float64)
-        points += [rays.origins + distance * rays.directions for distance in (camera.near, camera.far)]
+        directions = camera.turned(_nine_points(*camera.inner))
+        points += [camera.center + distance * directions for distance in (camera.near, camera.far)]
     cloud = torch.cat(points)
     return Box(tuple(cloud.amin(0).tolist()), tuple(cloud.amax(0).tolist()))
 
@@ -156,18 +156,26 @@ def check_camera(camera: Camera, middle: str, lens: str) -> None:
 
 @lru_cache(1024)
 def _can_be_undone(*inner: float | Lens) -> bool:
-    camera = Camera.at_origin(*inner)
-    pixels = nine_pixels(camera)
-    u, v = pixels % camera.width + 0.5, torch.div(pixels, camera.width, rounding_mode="floor") + 0.5
-    again, _ = camera.project(camera.directions(u, v))
-    return bool(((again - torch.stack([u, v], -1)).abs() < _SAME_PIXEL).all())
+    again, _ = Camera.at_origin(*inner).project(_nine_points(*inner))
+    return bool(((again - _nine_places(*inner[:2])).abs() < _SAME_PIXEL).all())
 
 
-def nine_pixels(camera: Camera) -> torch.Tensor:
+@lru_cache(1024)
+def _nine_points(*inner: float | Lens) -> Tensor:
+    """Points (9, 3) of the camera's axes that ``nine_pixels`` show, once for all cameras of a film."""
+    return Camera.at_origin(*inner).straight(*_nine_places(*inner[:2]).unbind(-1))
+
+
+def _nine_places(width: int, height: int) -> Tensor:
+    columns = torch.tensor([0, width // 2, width - 1])
+    rows = torch.tensor([0, height // 2, height - 1])
+    return torch.cartesian_prod(rows, columns).flip(-1).double() + 0.5
+
+
+def nine_pixels(camera: Camera) -> Tensor:
     """Flat indices (9,) of the corners, the middles of the edges and the centre."""
-    columns = torch.tensor([0, camera.width // 2, camera.width - 1])
-    rows = torch.tensor([0, camera.height // 2, camera.height - 1])
-    return (rows[:, None] * camera.width + columns).flatten()
+    columns, rows = _nine_places(camera.width, camera.height).long().unbind(-1)
+    return rows * camera.width + columns
 
 
 @dataclass(frozen=True)

@@ -190,12 +190,21 @@ class Camera:
         """Make unit world directions (..., 3) float64 through pixel coordinates ``u v`` (...,), measured from
         the image's top-left corner; lens and skew are undone.
         """
+        return self.turned(self.straight(u, v))
+
+    def straight(self, u: Vector, v: Vector) -> Tensor:
+        """Return the points (..., 3) float64 of the camera's axes, at depth 1, that pixel coordinates
+        ``u v`` (...,) show; the same for all poses.
+        """
         y = (_numbers(v).double() - self.cy) / self.fy
         x = (_numbers(u).double() - self.cx - self.skew * y) / self.fx
         if self.lens is not None:
             x, y = self.lens.straighten(torch.stack([x, y], -1)).unbind(-1)
-        local = torch.stack([x, y, torch.ones_like(x)], -1)
-        return torch.nn.functional.normalize(local @ self.camera_to_world[:3, :3].T, dim=-1)
+        return torch.stack([x, y, torch.ones_like(x)], -1)
+
+    def turned(self, points: Tensor) -> Tensor:
+        """Return the unit world directions (..., 3) towards points (..., 3) float64 of the camera's axes."""
+        return torch.nn.functional.normalize(points @ self.camera_to_world[:3, :3].T, dim=-1)
 
     def project(self, points: Vector) -> tuple[Tensor, Tensor]:
         """Project world points (..., 3): pixel coordinates (..., 2) from the top-left corner, and depth along
