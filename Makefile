@@ -61,7 +61,7 @@ test-floors: ## run the same tests with the lowest versions that pyproject.toml 
 	$(LINKS); VIRTUAL_ENV="$$PWD/$(FLOORS)" $(FLOORS)/bin/uv pip install --resolution lowest-direct \
 		-e '.[cpu,synth,plots,viewer,export,usd,capture,dev]'
 	$(FLOORS)/bin/pytest --no-cov -W default -m "not slow" # they warn of what came later
-fuzz: ## read 5,000 harmed files of every format, the same each time: none may take 10 s, a gigabyte, or a traceback
+fuzz: ## read 5,000 harmed files of every format, the same each time: none may take 10 s of the processor, a gigabyte, or a traceback
 	OMP_NUM_THREADS=1 $(BIN)/pytest --no-cov -q -s tests/stability/test_fuzzing.py --hypothesis-profile=fuzz
 conformance: ## test every method against the contract, slow cases too, and write docs/results/conformance.md
 	OMP_NUM_THREADS=1 $(BIN)/pytest --no-cov -q tests/contract/test_contract.py --conformance=docs/results/conformance.md

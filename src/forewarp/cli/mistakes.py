@@ -208,6 +208,9 @@ def one_line(error: BaseException) -> str | None:
     missing = re.search(r"Missing mandatory value: ([\w.]+)", str(error))
     if missing and isinstance(error, OmegaConfBaseException):
         return f"{missing[1]}: expected a value, but got none; set {missing[1]}=..."
+    absent = re.match(r"Missing key .*?\n *full_key: *(\S+)", str(error), re.DOTALL)
+    if absent and isinstance(error, OmegaConfBaseException):  # a stored config, from which it was taken
+        return f"{absent[1]}: expected a value in the run's config.yaml, but got no such key; add {absent[1]}"
     if getattr(error, "override", None):  # Hydra could not parse it
         return f"{error.override}: {flat(str(error))}"
     if isinstance(error, HydraException) and (line := _of_hydra(str(error))):
