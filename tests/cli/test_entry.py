@@ -19,6 +19,7 @@ from hydra.errors import HydraException
 from jinja2 import UndefinedError
 from lightning.pytorch.loggers import mlflow
 from omegaconf import OmegaConf
+from omegaconf.errors import ConfigKeyError
 
 from forewarp.cli import entry
 from forewarp.cli.mistakes import one_line, unknown_key, with_run_key
@@ -283,6 +284,10 @@ def test_interruption_says_how_to_go_on(forewarp, monkeypatch, in_tmp, by, numbe
         (
             UndefinedError("'x' is undefined"),
             "runs: expected files as forewarp-train and forewarp-evaluate write",
+        ),
+        (
+            ConfigKeyError("Missing key c\n    full_key: a.c\n    object_type=dict"),
+            "a.c: expected a value in the run's config.yaml, but got no such key; add a.c",
         ),
         (ModuleNotFoundError("No module named 'trimesh'"), "No module named 'trimesh'; install it with make"),
     ],

@@ -241,7 +241,7 @@ def small_dome(folder):
 
 
 def video(folder):
-    written.write_video(folder, times=[i / 5 for i in range(6)], channels=4)
+    written.write_video(folder, count=6, times=[i / 5 for i in range(6)], channels=4)
 
 
 def films(folder):

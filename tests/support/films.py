@@ -23,7 +23,6 @@ def write_film(path, frames, *, stamps="N*40", rotation=0, options=(), inputs=()
     ffmpeg = [imageio_ffmpeg.get_ffmpeg_exe(), "-y", "-v", "error"]
     shape = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-i", "-", *inputs]
     times = ["-vf", f"settb=1/1000,setpts='{stamps}'", "-fps_mode", "passthrough", "-enc_time_base", "1:1000"]
-    times += ["-bsf:v", "setts=duration=40:pts=PTS:dts=DTS"]  # ffmpeg 7 would show the last frame for no time
     flat = path.with_name(f"flat_{path.name}") if rotation else path
     coded = ["-c:v", "libx264", "-qp", "4", "-pix_fmt", "yuv420p", "-video_track_timescale", "1000", *options]
     subprocess.run([*ffmpeg, *shape, *times, *coded, str(flat)], input=frames.tobytes(), check=True)
