@@ -8,7 +8,7 @@ import re
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from typing import TextIO
 
@@ -87,26 +87,36 @@ def time_text(seconds: float) -> str:
 
 @contextmanager
 def told_if_slow(title: str, text: str, *, after: float = 3.0) -> Iterator[None]:
-    """Print a line, ``title``, 0 % and ``text``, once what is within has taken ``after`` seconds.
+    """Show a line, ``title``, 0 % and ``text``, once what is within has taken ``after`` seconds; in a
+    terminal with the seconds so far, so that one sees that it goes on.
 
     Args:
         title: what runs.
         text: what takes the time.
         after: seconds.
     """
-    line = f"{title} {0:4.0%} | {text}"
-    timer = threading.Timer(after, print, [line], {"file": sys.stderr, "flush": True})
-    timer.daemon = True
-    timer.start()
+    line, ended, begin = ProgressLine(title, refresh=1.0), threading.Event(), time.perf_counter()
+
+    def show() -> None:
+        wait = after
+        while not ended.wait(wait):
+            line.say(0.0, f"{time_text(time.perf_counter() - begin)} | {text}" if line.terminal else text)
+            wait = line.interval if line.terminal else None  # elsewhere a line will do
+
+    thread = threading.Thread(target=show, daemon=True)
+    thread.start()
     try:
         yield
     finally:
-        timer.cancel()
-        timer.join()
+        ended.set()
+        thread.join()
+        line.release()
 
 
 class ProgressLine:
     """A line with a title, the share that is done, the time left and a text.
+
+    Within the part of a ``WholeProgress`` its line is updated in place of this one.
 
     Args:
         title: what runs.
@@ -114,6 +124,8 @@ class ProgressLine:
         every: seconds between two lines elsewhere.
         stream: None: stderr.
     """
+
+    whole: WholeProgress | None = None  # that all lines belong to now
 
     def __init__(
         self, title: str, *, refresh: float = 0.25, every: float = 10.0, stream: TextIO | None = None
@@ -126,7 +138,7 @@ class ProgressLine:
 
     def due(self) -> bool:
         """Tell whether an update is due; ask this before making a text."""
-        return time.perf_counter() >= self._next
+        return self.whole.line.due() if self._is_part else time.perf_counter() >= self._next
 
     def show(self, fraction: float, left: float | None, text: str) -> None:
         """Update the line now.
@@ -136,35 +148,98 @@ class ProgressLine:
             left: seconds; None: unknown.
             text: shown at the end.
         """
-        remaining = "-:--" if left is None else time_text(left)
-        self._say(fraction, f"{remaining} left | {text}")
+        if self._is_part:
+            self.whole.show(left, f"{self.title} {fraction:.0%} | {text}")
+            return
+        self.say(fraction, f"{'-:--' if left is None else time_text(left)} left | {text}")
         self._next = time.perf_counter() + self.interval
 
     def close(self, fraction: float, text: str) -> None:
         """Write the last line and release the terminal."""
-        self._say(fraction, text)
+        if not self._is_part:
+            self.say(fraction, text)
+            self.release()
+
+    def release(self) -> None:
+        """Release the terminal."""
         if self._bar is not None:
             self._bar.stop()
             self._bar = None
 
-    def _say(self, fraction: float, text: str) -> None:
+    def say(self, fraction: float, text: str) -> None:
+        """Update the line now, with no time left."""
+        if self._is_part:
+            self.whole.show(None, f"{self.title} | {text}")
+            return
         text = f"{fraction:4.0%} | {text}"
         if not self.terminal:
             print(f"{self.title} {text}", file=self.stream, flush=True)
             return
         if self._bar is None:
-            # A narrow terminal cuts the text, not the title or the bar.
+            # A narrow terminal cuts the end of the text, not the title or the bar.
             columns = (
                 TextColumn("{task.description}", table_column=Column(min_width=len(self.title))),
                 BarColumn(bar_width=12, table_column=Column(min_width=12)),
                 TextColumn("{task.fields[text]}", markup=False, table_column=Column(ratio=1, no_wrap=True)),
             )
-            # Without a thread of its own it costs nothing between two updates.
-            console = TextConsole(self.stream)
-            self._bar = Progress(*columns, console=console, auto_refresh=False, expand=True)
+            # Without a thread of its own it costs nothing between two updates. What is printed into a file
+            # stays there.
+            options = {"auto_refresh": False, "expand": True, "redirect_stdout": sys.stdout.isatty()}
+            self._bar = Progress(*columns, console=TextConsole(self.stream), **options)
             self._task = self._bar.add_task(self.title, total=1.0, text="")
             self._bar.start()
         self._bar.update(self._task, completed=fraction, text=text, refresh=True)
+
+    @property
+    def _is_part(self) -> bool:
+        return self.whole is not None and self.whole.line is not self
+
+
+class WholeProgress:
+    """One line for several parts, each of which has lines of its own: with the time left of all.
+
+    Args:
+        title: what runs.
+        seconds: by the names of all parts in their order, how long they may take.
+        stream: None: stderr.
+    """
+
+    def __init__(self, title: str, seconds: Mapping[str, float], stream: TextIO | None = None) -> None:
+        self.line, self.seconds = ProgressLine(title, stream=stream), dict(seconds)
+        self.begin, self._name, self._since, self._done = time.perf_counter(), "", 0.0, 0.0
+
+    @contextmanager
+    def part(self, name: str) -> Iterator[None]:
+        """Let lines within be those of a part."""
+        self._name, self._since = name, time.perf_counter()
+        ProgressLine.whole = self
+        try:
+            self.show(None, "")
+            yield
+        finally:
+            ProgressLine.whole = None
+
+    def show(self, left: float | None, text: str) -> None:
+        """Update the line: ``left`` are seconds of the line that the part shows now, None: unknown."""
+        now, names = time.perf_counter(), list(self.seconds)
+        at = names.index(self._name)
+        of_part = max(left or 0.0, self.seconds[self._name] - (now - self._since))
+        remaining = of_part + sum(self.seconds[name] for name in names[at + 1 :])
+        spent = now - self.begin
+        self._done = max(self._done, spent / max(spent + remaining, 1e-9))  # it never goes back
+        self.line.show(
+            self._done, remaining, f"{at + 1}/{len(names)} {self._name}" + f" | {text}" * bool(text)
+        )
+
+    def __enter__(self) -> WholeProgress:
+        return self
+
+    def __exit__(self, *error) -> None:
+        if error[0] is None and self.seconds:
+            self.line.close(
+                1.0, f"{len(self.seconds)} parts in {time_text(time.perf_counter() - self.begin)}"
+            )
+        self.line.release()
 
 
 class Counted:

@@ -26,7 +26,7 @@ class StageProgress(lightning.Callback):
         refresh: seconds between two drawings of the bar.
         every: seconds between two lines.
 
-    Set ``later`` to the seconds that the following stages may take, to show the time left of all stages.
+    Set ``later`` to the seconds that the following stages may take: the time left is that of all stages.
 
     Cost: a step reads the clock; a drawing takes about a millisecond.
     """
@@ -54,11 +54,9 @@ class StageProgress(lightning.Callback):
         if self._line.due():
             fraction, seconds = module.fraction, module.clock.seconds
             left = seconds * (1 - fraction) / fraction if fraction > 0 else None
-            text = self._text(module)
-            if left is not None and self.later:
-                text = f"{time_text(left + self.later)} to the end of the run | {text}"
+            left = None if left is None else left + (self.later or 0.0)
             with module.clock.paused():
-                self._line.show(fraction, left, text)
+                self._line.show(fraction, left, self._text(module))
 
     def on_train_end(self, trainer, module, exception=None) -> None:
         """Leave a last line with the final values, also after an exception, and restore the terminal."""
@@ -72,10 +70,11 @@ class StageProgress(lightning.Callback):
     def _text(self, module) -> str:
         curriculum, (kind, count) = module.curriculum, module.method.size
         psnr, speed = self._psnr / max(self._seen, _SMOOTHING), self._steps_a_second(module.global_step)
-        return (
-            f"train psnr {psnr:.1f} | loss {module.last['loss']:.4f} | "
-            f"frames {curriculum.in_play}/{len(curriculum.order)} | {kind} {count:,}"
-            + ("" if speed is None else f" | {speed:.1f} steps/s")
+        return (  # what matters first: a narrow terminal cuts the end
+            f"train psnr {psnr:.1f} | "
+            + ("" if speed is None else f"{speed:.1f} steps/s | ")
+            + f"frames {curriculum.in_play}/{len(curriculum.order)} | {kind} {count:,} | "
+            + f"loss {module.last['loss']:.4f}"
         )
 
     def _steps_a_second(self, step: int) -> float | None:
