@@ -32,7 +32,7 @@ from forewarp.scene.frame import Scene, spread, walk_of
 from forewarp.scene.view import Moment, Rendering, Target, View
 from forewarp.training.module import DynamicSceneModule
 
-FAMILIES = ("lpips", "mlpips", "ms_ssim", "depth")
+NOT_PRINTED = ("ms_ssim_legacy", "dssim")  # metrics of others' tables, which metrics.json has
 _PAIRS = 24  # of images, between which motion is looked at
 PCK = 0.05  # of an image's longer side, within which a keypoint is where it should be
 _SHEET_SIDE = 300  # least pixels of the shorter side of an image on a sheet
@@ -179,6 +179,8 @@ def evaluate(
     if trust := trust_of(module.method, scene, whole, chosen, drop_of(metrics["test"])):
         metrics["trust"] = trust
     metrics["metrics"] = described(dict.fromkeys(n for scores in metrics["test"].values() for n in scores))
+    if suite.absent:
+        metrics["absent"] = dict(suite.absent)
     if targets := [done["target"] for done in finished.values() if "target" in done]:
         metrics["target"] = targets[-1]
     for name in others:
@@ -378,8 +380,10 @@ def _depth_parts(rendering: Rendering, target: Target) -> list[Tensor]:
     return [*drawn, error_colors(over, torch.zeros_like(over))]
 
 
-def show(metrics: dict, folder: Path, absent: dict[str, str]) -> None:
-    """Print the numbers and the paths of the files."""
+def show(metrics: dict, folder: Path) -> None:
+    """Print what a user asks for first and the paths of the files: ``metrics.json`` has all numbers, what was
+    not measured and why (``absent``), and in ``protocol`` what differs from a publication.
+    """
     console, seconds, flow = TextConsole(), metrics["seconds"], metrics.get("flow")
     console.print(table_of(metrics))
     others = ("train", "render_per_frame", "render_again_per_frame")
@@ -392,32 +396,17 @@ def show(metrics: dict, folder: Path, absent: dict[str, str]) -> None:
         lines.append(f"flow: moving points off by {error:.4f}, {share}")
     if keypoints := metrics.get("keypoints"):
         lines.append(f"keypoints: {keypoints['pck_t']:.1%} carried to within {PCK:.0%} of an image (PCK-T)")
-    lines += [*notes_of(metrics["protocol"]), *([without(absent)] if absent else [])]
     lines += [f"numbers  {folder / 'metrics.json'}", f"images   {folder / 'images'}"]
     if (sheets := folder / "images" / "sheets").is_dir():
         lines.append(f"sheets   {sheets}: truth | prediction | error")
     console.print("\n".join(lines), highlight=False, soft_wrap=True)
 
 
-def notes_of(protocol: Mapping) -> list[str]:
-    """Say in a line each what a method does otherwise than published, and which faults it keeps, if any."""
-    return [f"{key}: {protocol[key]}" for key in ("departures", "faults") if key in protocol]
-
-
-def without(absent: dict[str, str]) -> str:
-    """Say in one line which metrics are missing and why; name a whole family once."""
-    reasons: dict[str, str] = {}
-    for name, reason in absent.items():
-        family = next((f for f in FAMILIES if name.startswith(f)), name)
-        is_whole = all(metric in absent for metric in METRICS if metric.startswith(family))
-        reasons.setdefault(family if is_whole else name, reason)
-    return "without " + ", ".join(f"{name} ({reason})" for name, reason in reasons.items())
-
-
 def table_of(metrics: dict) -> Table:
     """Make a table with a row for every rendering and kind of test view, and a column for every metric."""
     kinds = {key: value for key, value in metrics.items() if key.split("_")[0] == "test"}
-    names = [m for m in METRICS if any(m in scores for kind in kinds.values() for scores in kind.values())]
+    measured = {name for kind in kinds.values() for scores in kind.values() for name in scores}
+    names = [name for name in METRICS if name in measured - {*NOT_PRINTED}]
     title = f"{metrics['protocol']['scene']}, {metrics['protocol'].get('method', '')}"
     table = Table("test views", title=title, title_justify="left", box=box.SIMPLE)
     for name in names:
