@@ -254,7 +254,8 @@ def run(steps=5000, iterations=None, suspects=SceneDataModule.suspects, scene=SC
     data.suspects = suspects
     settings = StageSettings("fine", {}, iterations=iterations, minutes=None if iterations else 0.05)
     stage, made = SimpleNamespace(settings=settings), {"fine": {"steps": steps, "seconds": 7.7, **noted}}
-    return SimpleNamespace(stages=[stage], datamodule=data, finished=lambda: made)
+    place = {"clock": "wall", "device": torch.device("cpu")}
+    return SimpleNamespace(stages=[stage], datamodule=data, finished=lambda: made, **place)
 
 
 def reaching(psnr):
@@ -264,6 +265,16 @@ def reaching(psnr):
 
 def test_a_good_fit_is_not_doubted():
     assert doubts(run(), reaching(30), "fast") == []
+
+
+def test_minutes_that_other_programs_took_are_told_with_the_steps_and_what_to_type():
+    clocks = {"clocks": {"wall": 60.0, "processor": 24.0}}
+    (line,) = doubts(run(**clocks), reaching(30), "fast")
+    assert "in 1:00 of training this one had 0:24 of processor time, 5,000 steps" in line
+    assert line.endswith("add budget.clock=processor")
+    for calm in ({"wall": 60.0, "processor": 31.0}, {"wall": 15.0, "processor": 1.0}):
+        assert doubts(run(clocks=calm), reaching(30), "fast") == []
+    assert doubts(run(iterations=9000, **clocks), reaching(30), "fast") == []  # whatever the time
 
 
 @pytest.mark.parametrize(("steps", "said"), [(1, "1 step in"), (49, "49 steps in"), (50, None)])

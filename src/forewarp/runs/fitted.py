@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import fmean
@@ -16,6 +16,7 @@ from hydra.utils import get_class
 from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
+from forewarp.clock import KINDS
 from forewarp.data.batches import COLORS, color_of
 from forewarp.data.checks import blind_frames, bounds
 from forewarp.data.files import mismatch, one_of
@@ -31,7 +32,7 @@ from forewarp.metrics.limits import NETS
 from forewarp.metrics.lpips import find_lpips, find_lpips_weights
 from forewarp.metrics.registry import METRICS, ImageSuite
 from forewarp.ops.backend import is_number
-from forewarp.progress import Counted
+from forewarp.progress import Counted, time_text
 from forewarp.runs.build import build_run
 from forewarp.runs.config import is_swept, saved_config, trust_of
 from forewarp.runs.overrides import key_of, typed_overrides
@@ -314,7 +315,7 @@ def measure_run(run: Run, module: DynamicSceneModule, config: DictConfig) -> dic
         protocol["doubts"] = lines
     with Counted("test views") as progress:
         metrics = evaluate(module, data, folder, suite, progress=progress, **options)
-    show(metrics, folder, suite.absent)
+    show(metrics, folder)
     tell(lines)
     return metrics
 
@@ -494,6 +495,8 @@ class TellBest(Callback):
 FEW = 50  # steps of a stage that can hardly have learned anything, if there were fewer
 SHORT = 1000  # steps of a run, or fewer, that may be all that is wrong with it
 LOW, ABOVE = 21.0, 5.0  # dB; a fit is in doubt below LOW, or less than ABOVE better than one colour
+LEAST_WALL = 20.0  # seconds of training, below which its processor time says little
+HALF, HALF_OF_TWO = 0.5, 0.75  # processors by which a thread, or several, fall short; two are never as fast
 _MORE = "raise the budget"  # which is no advice where a target ended training
 _VIEWS, _PIXELS = 8, 2000  # training images that are looked at, and pixels of each
 
@@ -528,6 +531,7 @@ def doubts(run: Run, module: DynamicSceneModule, preset: str) -> list[str]:
         never = f"{len(scene.train) - in_play} of {len(scene.train)} training images were never trained on"
         advice = f"{ended} ended training before their times came in" if ended else ""
         lines.append(f"{never}, as {advice or 'the budget ended before their times came in; raise it'}")
+    lines += busy(run, made)
     if blind := blind_frames(scene):
         lines.append(f"{blind} of {len(scene.train)} training cameras see nothing of the box {bounds(scene)}")
     reached, one_color = training_psnr(run, module)
@@ -539,6 +543,25 @@ def doubts(run: Run, module: DynamicSceneModule, preset: str) -> list[str]:
         causes = [cause for cause in causes if not (ended and cause.endswith(_MORE))][:3]
         lines += [f"  likely cause {number}: {cause}" for number, cause in enumerate(causes, 1)]
     return lines
+
+
+def busy(run: Run, made: Mapping[str, Mapping]) -> list[str]:
+    """Say in a line that training by the wall clock got less than half of its processor time.
+
+    Args:
+        run: the run; of one on a GPU, or whose minutes do not bound it, nothing is said.
+        made: the ``done.json`` of each stage.
+    """
+    bounded = [made[stage.settings.name] for stage in run.stages if stage.settings.minutes is not None]
+    if run.clock != "wall" or run.device.type != "cpu":
+        return []
+    wall, processor = (sum(noted.get("clocks", {}).get(kind, 0.0) for noted in bounded) for kind in KINDS)
+    if wall < LEAST_WALL or processor >= wall * (HALF if torch.get_num_threads() == 1 else HALF_OF_TWO):
+        return []
+    steps = sum(noted["steps"] for noted in bounded)
+    about = f"other programs kept the machine busy: in {time_text(wall)} of training this one had"
+    made_steps = f"{time_text(processor)} of processor time, {steps:,} steps"
+    return [f"{about} {made_steps}; for as many as on an idle machine, add budget.clock=processor"]
 
 
 def _likeliest(suspects: Sequence[str], steps: int, preset: str) -> list[str]:
