@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
 
+import cv2
 import numpy as np
 import torch
 from torch import Tensor
@@ -33,6 +34,7 @@ _MIN_SIDE = 96  # pixels: smaller copies are of no use
 _RESTING = 2  # images around the middle that say what rests in the whole film; one may be held out
 MASK = "masks/burnt_in.png"  # in the scene's folder: dark where something is burnt in
 _DRAWING, _BORDER = 640, 0.06  # pixels of each drawing; share of it that stays free at its ends
+_TITLE, _EDGE, _LETTERS = 48, 16, 0.45  # pixels above the drawings, left of texts; size of letters
 _FIRST, _LAST, _BOX = (0.10, 0.25, 0.75), (0.85, 0.20, 0.15), (0.55, 0.55, 0.55)  # colours of cameras, box
 _FRUSTA = 24  # cameras drawn with their view
 _MOSTLY = 0.5  # share of pixels that move, beyond which masks may be the other way round
@@ -199,12 +201,19 @@ def write(
 
 
 def draw(found: Reconstruction, limits: Limits, taken_by: Sequence[str] | None = None) -> Tensor:
-    """Draw the capture from above (x to the right, y up) and from the side (z up): (H, 2 H, 3) in [0, 1].
+    """Draw the capture from above (x to the right, y up) and from the side (z up): (H + title, 2 H, 3) in
+    [0, 1], with what is to be seen above, and the ends of the box at its edges.
 
     Cameras go from blue to red; grey is the box. Lines join the places of one camera: of a rig, ``taken_by``
     says which took each of the images.
     """
-    return torch.cat([_drawn(found, limits, axes, taken_by) for axes in ([0, 1], [0, 2])], 1)
+    image = torch.cat([_drawn(found, limits, axes, taken_by) for axes in ([0, 1], [0, 2])], 1)
+    image = torch.cat([torch.ones(_TITLE, image.shape[1], 3), image])
+    about = (
+        f"{len(found.cameras)} cameras from the first (blue) to the last (red), {len(found.points)} points"
+    )
+    views = [("from above", (_EDGE, _TITLE)), ("from the side", (_DRAWING + _EDGE, _TITLE))]
+    return _lettered(image, [(f"{about}; grey: the box", (_EDGE, _TITLE // 2)), *views])
 
 
 def _drawn(found: Reconstruction, limits: Limits, axes: list[int], taken_by: Sequence[str] | None) -> Tensor:
@@ -240,7 +249,25 @@ def _drawn(found: Reconstruction, limits: Limits, axes: list[int], taken_by: Seq
         image = with_lines(image, np.stack([centers[joined], centers[joined + 1]], 1), paint[joined], 0.8)
     every = 1 if taken_by and len({*taken_by}) == len(cameras) else max(1, len(cameras) // _FRUSTA)
     views = np.concatenate([_frustum(camera, 0.08 * span) for camera in cameras[::every]])
-    return with_lines(image, views, paint[::every].repeat_interleave(8, 0), 0.6)
+    image = with_lines(image, views, paint[::every].repeat_interleave(8, 0), 0.6)
+    (left, bottom), (right, top) = pixels(np.array([limits.box.low, limits.box.high])).tolist()
+    below, beside, names = bottom + 18, max(left - 44, 2), [" xyz"[axis + 1] for axis in axes]
+    texts = [(f"{x0:.2f}", (left, below)), (names[0], ((left + right) / 2, below))]
+    texts += [
+        (f"{x1:.2f}", (right - 34, below)),
+        (f"{y0:.2f}", (beside, bottom)),
+        (f"{y1:.2f}", (beside, top)),
+    ]
+    return _lettered(image, [*texts, (names[1], (left - 14, (bottom + top) / 2))])
+
+
+def _lettered(image: Tensor, texts: Sequence[tuple[str, tuple[float, float]]]) -> Tensor:
+    """Write texts into an image (H, W, 3), each from the left end of its baseline."""
+    pixels = (255 * image).byte().numpy()
+    for text, (column, row) in texts:
+        place = round(column), round(row)
+        cv2.putText(pixels, text, place, cv2.FONT_HERSHEY_SIMPLEX, _LETTERS, (60, 60, 60), 1, cv2.LINE_AA)
+    return torch.from_numpy(pixels).float() / 255
 
 
 def _frustum(camera: Camera, depth: float) -> np.ndarray:
