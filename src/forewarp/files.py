@@ -212,6 +212,11 @@ def check_replaceable(path: Path, mark: str) -> None:
         raise ValueError(f"{expected}, but got {others[0]} in it; move it, or choose another")
 
 
+def link_of(path: Path) -> str:
+    """Return the link that opens a file in a browser: ``file:///...``."""
+    return Path(path).resolve().as_uri()
+
+
 def replace_file(path: Path, content: bytes | str) -> None:
     """Write ``content`` as a whole file.
 

@@ -22,13 +22,14 @@ from omegaconf import OmegaConf
 from omegaconf.errors import ConfigKeyError
 
 from forewarp.cli import entry
-from forewarp.cli.mistakes import one_line, unknown_key, with_run_key
+from forewarp.cli.mistakes import one_line, unknown_key, with_keys
 from forewarp.data.files import SceneError
+from forewarp.runs.overrides import next_command
 from forewarp.runs.session import claim
 from tests.support.configs import CONF, ROOT, options
 
 TEXTS = {path.stem: path.read_text() for path in sorted(Path(entry.__file__).parent.glob("*.py"))}
-COMMANDS = ("train", "evaluate", "render", "export", "synthesize", "report", "capture")
+COMMANDS = ("open", "train", "evaluate", "render", "export", "synthesize", "report", "capture")
 
 
 @pytest.mark.parametrize(("policy", "spins"), [(None, "10000"), ("PASSIVE", "10000"), ("active", None)])
@@ -132,6 +133,8 @@ def test_options_of_ones_own_stand_beside_ours(ok, in_tmp):
             "model.blur: expected a key of the configuration, but got none",
         ),
         (["budget.minuts=1"], "got none of this name; did you mean budget.minutes?"),
+        (["minutes=2"], "got none of this name; did you mean budget.minutes?"),
+        (["experiment=video"], "; did you mean video_with_poses?"),
         (["model=forwrd"], "; did you mean forward?"),
         (["logger=[tensorboard,wand]"], "; none; tensorboard; wandb; did you mean wandb?"),
         (["--inf"], "--inf: expected an option of Hydra's, but got none of this name; did you mean --info?"),
@@ -204,11 +207,86 @@ def test_a_bare_folder_is_a_run(refused, in_tmp, name, key):
 def test_what_follows_an_option_is_no_run(in_tmp):
     (in_tmp / "demo").mkdir()
     words = ["--config-dir", "demo", "demo", "run=demo", "-x", "other"]
-    assert with_run_key("render", words) == ["--config-dir", "demo", "run=demo", "run=demo", "-x", "other"]
-    assert with_run_key("report", ["demo"]) == ["demo"]
+    assert with_keys("render", words) == ["--config-dir", "demo", "run=demo", "run=demo", "-x", "other"]
+    assert with_keys("synthesize", ["demo"]) == ["demo"]
     for name in ("~stage.coarse", "seed=0"):  # an override, though a sweep's folder has this name
         (in_tmp / name).mkdir()
-        assert with_run_key("render", [name, f"./{name}"]) == [name, f"run=./{name}"]
+        assert with_keys("render", [name, f"./{name}"]) == [name, f"run=./{name}"]
+
+
+@pytest.mark.parametrize(
+    ("typed", "path", "printed"),
+    [
+        (".venv/bin/forewarp-train", "", ".venv/bin/forewarp-view"),
+        ("{0}/.venv/bin/forewarp-train", "", ".venv/bin/forewarp-view"),
+        ("{0}/.venv/bin/forewarp-train", "{0}/.venv/bin", "forewarp-view"),
+        ("/elsewhere/bin/forewarp-train", "", "/elsewhere/bin/forewarp-view"),
+        ("forewarp-train", "", "forewarp-view"),
+        ("/usr/bin/pytest", "", "forewarp-view"),
+    ],
+)
+def test_a_command_to_type_next_has_the_path_of_this_one(in_tmp, monkeypatch, typed, path, printed):
+    program = in_tmp / ".venv" / "bin" / "forewarp-view"
+    program.parent.mkdir(parents=True)
+    program.touch(0o755)
+    monkeypatch.setattr(sys, "argv", [typed.format(in_tmp)])
+    monkeypatch.setenv("PATH", path.format(in_tmp) or str(in_tmp))
+    assert next_command("view", ["run=a b"]) == f"{printed} 'run=a b'"
+
+
+@pytest.fixture
+def things(in_tmp):
+    """A run of a clip, two of another one, a scene, films and images."""
+    for run in ("opened/clip/runs/a", "runs/hand/a", "runs/hand/b"):
+        (in_tmp / run).mkdir(parents=True)
+        (in_tmp / run / "config.yaml").touch()
+    for file in (
+        "captures/hand/transforms.json",
+        "clip.mp4",
+        "films/a.MOV",
+        "pictures/a.png",
+        "rig/cam0/a.png",
+    ):
+        (in_tmp / file).parent.mkdir(parents=True, exist_ok=True)
+        (in_tmp / file).touch()
+
+
+@pytest.mark.parametrize(
+    ("name", "word", "meant"),
+    [
+        ("capture", "clip.mp4", ["video=clip.mp4"]),
+        ("capture", "gone.mp4", ["video=gone.mp4"]),
+        ("capture", "films", ["videos=films"]),
+        ("capture", "rig", ["videos=rig"]),
+        ("capture", "pictures", ["images=pictures"]),
+        ("open", "clip.mp4", ["video=clip.mp4"]),
+        ("view", "clip", ["run=opened/clip/runs/a"]),
+        ("view", "runs/hand/b", ["run=runs/hand/b"]),
+        ("report", "clip", ["run=opened/clip/runs/a", "kind=run"]),
+        ("report", "run=runs/hand/a", ["run=runs/hand/a", "kind=run"]),
+        ("report", "runs/hand", ["runs=runs/hand"]),
+        ("train", "runs/hand/a", ["resume=runs/hand/a"]),
+        ("view", "nothing", ["nothing"]),
+    ],
+)
+def test_a_file_or_folder_alone_means_what_it_is(things, name, word, meant):
+    assert with_keys(name, [word]) == meant
+
+
+@pytest.mark.parametrize(
+    ("name", "word", "says"),
+    [
+        (
+            "view",
+            "clip.mp4",
+            "clip.mp4: expected the folder of a run, but got a film; type forewarp-open clip.mp4",
+        ),
+        ("view", "hand", "hand: expected one run, but got 2; type run= and one of runs/hand/a, runs/hand/b"),
+        ("train", "captures/hand", "got a scene; type forewarp-train experiment=video_with_poses data.root="),
+    ],
+)
+def test_what_a_command_cannot_take_is_refused_with_what_to_type(refused, things, name, word, says):
+    assert says in refused(name, word)
 
 
 def test_an_interpolation_is_typed_as_it_is(refused, in_tmp):

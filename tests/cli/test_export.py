@@ -46,6 +46,7 @@ def test_it_writes_what_the_run_has_into_its_folder_and_says_so(forewarp, ok, fi
         (["times=[0,2]"], "each later than the one before, but got [0, 2]"),
         (["times=[1,0]"], "expected numbers in [0, 1], each later than the one before, but got [1, 0]"),
         (["times=[]"], "each later than the one before, but got []"),
+        (["format=mp4"], "but got 'mp4'; a film is made by forewarp-render"),
         (["points=9"], "points: expected an option of format=ply (degree, up, compressed); leave it out"),
         (["format=glb", "times=3"], "times: expected none with format=glb, which holds all times; leave it"),
         (["format=glb", "quality=high"], "quality: expected compact or lossless, but got high"),

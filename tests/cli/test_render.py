@@ -55,6 +55,7 @@ def test_a_gif_of_small_images_is_larger_and_large_images_keep_their_size(ok, ru
         ("path=lean", "path: expected fixed, swing, orbit, both or trajectories, as no one camera filmed"),
         ("fps=0", "fps: expected a number in [0.1, 1000], but got 0"),
         ("format=avi", "format: expected mp4, gif or png, but got 'avi'"),
+        ("format=html", "format: expected mp4, gif or png, but got 'html'; it is written by forewarp-export"),
         ("layer=still", "layer: expected all, moving or resting, but got 'still'"),
         ("masks=folder", "masks: expected true or false, but got 'folder'"),
         ("view=99", "view: expected a test view, 0 to 4, but got 99"),

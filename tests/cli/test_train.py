@@ -164,7 +164,7 @@ def test_the_same_command_again_trains_nothing(ok, fitted, scenes, monkeypatch):
     done = ok(*arguments(scenes, fitted), "threads=2")
     assert numbers(fitted) == before
     assert (fitted / "config.yaml").read_text() == config  # its numbers are not of two threads
-    assert done.out.startswith(f"measured before: {fitted}; again with forewarp-evaluate run={fitted}")
+    assert done.out.startswith(f"measured before: {fitted}; again with\n  forewarp-evaluate run={fitted}\n")
 
 
 def test_a_begun_run_is_finished_and_measured_and_what_does_not_matter_may_change(ok, fitted, begun, scenes):
@@ -219,7 +219,7 @@ def test_a_run_with_views_set_aside_leaves_its_curve(ok, scenes, tmp_path):
     done = ok(*arguments(scenes, run, *SHORT, "data.held_out=2", "callbacks.accuracy.first=0.001"))
     assert len((run / "accuracy_time.csv").read_text().splitlines()) > 1
     assert (run / "accuracy_time.png").stat().st_size > 1000
-    assert f"fitted: {run}; measure it with forewarp-evaluate run={run}\n" in done.out
+    assert f"fitted: {run}; measure it with\n  forewarp-evaluate run={run}\n" in done.out
 
 
 @pytest.mark.slow

@@ -2,8 +2,10 @@
 forewarp-capture makes a scene from a video, or from those of several cameras: it takes frames, finds the
 cameras' poses from what stands still, and writes what experiment=video_with_poses reads (docs/capture.md).
 
-  forewarp-capture video=hand.mp4 out=captures/hand
-  forewarp-train experiment=video_with_poses data.root=captures data.scene=hand
+  forewarp-capture hand.mp4 out=captures/hand
+  forewarp-train experiment=video_with_poses data.root=captures data.scene=hand budget.minutes=5
+
+forewarp-open hand.mp4 does this and all that follows, up to a page that plays it.
 
 What one types most:
   video=FILE                    a video; its rotation flag and its own time stamps are heeded. A scan of
@@ -44,13 +46,14 @@ from forewarp.cli.entry import command
 from forewarp.data.files import LAYOUTS, one_of, threads_of, whole
 from forewarp.files import check_replaceable
 from forewarp.runs.config import check_seed
-from forewarp.runs.overrides import command_line, text_override
+from forewarp.runs.overrides import next_command, text_override
 
 MATCHING = ("auto", "sequential", "exhaustive")
 PATHS = ("video", "videos", "images", "colmap", "masks", "out")
 # Keys of several cameras, and what they are where they are not set.
 RIG = {"offsets": None, "without": [], "fixed": None, "rate": None}
 LEAST_HELD = 4  # cameras from which on one is held out by the command that comes next
+MINUTES = 5  # of training in the command that comes next
 SUFFIX = ".r3d"  # of scans by Record3D
 LENSES = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
 
@@ -86,7 +89,8 @@ def capture(config) -> None:
     drawn = out / PICTURE
     print(*lines, f"written: {out}" + (f"; see {drawn}" if drawn.is_file() else ""), sep="\n")
     where = [text_override("data.root", str(out.parent)), text_override("data.scene", out.name), *held]
-    print(f"next: {command_line('train', ['experiment=video_with_poses', *where])}")
+    words = ["experiment=video_with_poses", *where, f"budget.minutes={MINUTES}"]
+    print("next:", f"  {next_command('train', words)}", sep="\n")
 
 
 def is_scan(video) -> bool:

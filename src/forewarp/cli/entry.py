@@ -18,7 +18,7 @@ from contextlib import suppress
 from pathlib import Path
 
 import forewarp
-from forewarp.cli.mistakes import flat, one_line, options_last, refuse_dashes, unknown_key, with_run_key
+from forewarp.cli.mistakes import flat, one_line, options_last, refuse_dashes, unknown_key, with_keys
 from forewarp.interrupts import listening, signal_of
 from forewarp.progress import printable_output
 from forewarp.provenance import import_nothing_from_here
@@ -81,13 +81,30 @@ def command(name: str, task: Callable, text: str, *, config: str | None = None) 
     sys.exit(max(failures, default=0))
 
 
+def run_part(name: str, task: Callable, typed: Sequence[str]) -> None:
+    """Run another command within this one, as if these words were typed after its name; where it fails, which
+    it has told, leave with its status.
+    """
+    from hydra.core.global_hydra import GlobalHydra
+
+    of_this, words = GlobalHydra.instance().hydra, sys.argv
+    GlobalHydra.instance().clear()
+    try:
+        sys.argv = [str(Path(words[0]).with_name(f"forewarp-{name}")), *arguments_of(name, typed)]
+        failures = _run(name, task, configurations(), name)
+    finally:
+        sys.argv, GlobalHydra.instance().hydra = words, of_this
+    if any(failures):
+        sys.exit(max(failures))
+
+
 def arguments_of(name: str, typed: Sequence[str]) -> list[str]:
-    """Return a command line as Hydra takes it: a bare folder has its key, a plan is its overrides, options
-    come last.
+    """Return a command line as Hydra takes it: a bare file or folder has its key, a plan is its overrides,
+    options come last.
 
     ``dataset=NAME`` is ``experiment=NAME`` where scenes are trained on, and a group where they are written.
     """
-    arguments = as_text(with_run_key(name, typed))
+    arguments = as_text(with_keys(name, typed))
     if name in ("train", "plan"):
         arguments = [re.sub(r"^dataset=", "experiment=", argument) for argument in arguments]
         for seeds in (argument[6:] for argument in arguments if argument.startswith("seeds=")):
@@ -241,7 +258,8 @@ def interrupted(name: str, interruption: KeyboardInterrupt) -> int:
     """Say what ended a command and how to go on; return the exit status, 128 and the number of the signal."""
     number = signal_of(interruption)
     ended = "interrupted" if number == signal.SIGINT else f"ended by {number.name}"
-    way = {"train": " to go on from the last checkpoint", "reproduce": " to go on"}.get(name, "")
+    ways = dict.fromkeys(("reproduce", "open"), " to go on")
+    way = {"train": " to go on from the last checkpoint", **ways}.get(name, "")
     print(f"\nforewarp-{name}: {ended}; run the same command again{way}", file=sys.stderr)
     return INTERRUPTED + number
 

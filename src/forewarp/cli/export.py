@@ -36,6 +36,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from forewarp.cli.entry import command
+from forewarp.files import link_of
 
 
 def export(config) -> None:
@@ -65,6 +66,8 @@ def export(config) -> None:
         written = write(config.format, source, folder, about, progress, **options)
     files = list(written["bytes"])
     print(f"written: {folder / files[0] if len(files) == 1 else folder}: {summary(written)}")
+    if config.format == "html":
+        print(link_of(folder / files[0]))
 
 
 def saved_runs(config) -> list:
@@ -125,9 +128,14 @@ def check(config, windows: int = 1) -> list[float]:
 
     from forewarp.data.files import mismatch, one_of
     from forewarp.export.formats import FORMATS, check_option, require
-    from forewarp.runs.overrides import key_of, typed_overrides
+    from forewarp.runs.overrides import key_of, next_command, typed_overrides
 
-    one_of(config.format, "format", *FORMATS)
+    if config.format not in FORMATS:
+        from forewarp.drawing.images import FORMATS as OF_FILMS  # late: it loads torch
+
+        words = [f"run={config.run or '<a run>'}", f"format={config.format}"]
+        advice = f"a film is made by {next_command('render', words)}" if config.format in OF_FILMS else ""
+        one_of(config.format, "format", *FORMATS, advice=advice)
     form, name = FORMATS[config.format], f"format={config.format}"
     if windows > 1 and form.times:
         raise mismatch("format", "glb or html for a film's windows", config.format, "export one of them")

@@ -5,12 +5,15 @@ from __future__ import annotations
 import difflib
 import errno
 import inspect
+import mimetypes
 import os
 import re
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
+from shlex import quote
 
+from forewarp.data.files import LAYOUTS, layout_of
 from forewarp.runs.config_files import configurations, installed
 from forewarp.runs.overrides import key_of
 
@@ -19,26 +22,74 @@ OF_METHODS = ("model", "modules", "objective", "preset", "stage")  # what method
 VALUED = ("cfg", "package", "config-path", "config-name", "config-dir", "experimental-rerun")
 OPTIONS = (*VALUED, "help", "hydra-help", "version", "resolve", "run", "multirun", "shell-completion", "info")
 VALUED = {*(f"--{option}" for option in VALUED), "-c", "-p", "-cp", "-cn", "-cd"}
-FOLDERS = {"evaluate": "run", "render": "run", "view": "run", "export": "run", "train": "resume"}
+# Commands that take a file or a folder alone, and the key that it is the value of.
+KEYS = {
+    "evaluate": "run",
+    "render": "run",
+    "view": "run",
+    "export": "run",
+    "report": "run",
+    "train": "resume",
+}
+KEYS |= {"capture": "video", "open": "video"}
+RESULTS = ("runs", "opened")  # where runs lie by default: those in runs/hand are meant by hand, too
+_OF_RUN = ("config.yaml", "*/config.yaml", "*/*/config.yaml")  # of its folder, and of those above
 
 
-def with_run_key(name: str, arguments: list[str]) -> list[str]:
-    """Put ``run=`` (for ``train``: ``resume=``) before a bare folder. One whose name reads as an override, as
-    Hydra names those of a sweep, needs its path: ``./seed=0``, ``runs/seed=0``.
+def with_keys(name: str, arguments: list[str]) -> list[str]:
+    """Put the key before a file or folder that is typed alone: ``run=`` before that of a run, also of one
+    that holds a single run; ``resume=`` for ``train``; ``video=``, ``images=`` or ``videos=`` for
+    ``capture``. A folder whose name reads as an override, as Hydra names those of a sweep, needs its path:
+    ``./seed=0``.
 
     Args:
         name: name of the command.
         arguments: arguments of the command line.
+
+    Raises:
+        ValueError: for what the command cannot take, with what to type.
     """
-    if (key := FOLDERS.get(name)) is None:
-        return arguments
-
-    def is_bare(word: str, before: str) -> bool:
+    found = []
+    for word, before in zip(arguments, ["", *arguments]):
         is_other = re.match("$|[-~+]|[^/]*=", word) is not None  # nothing, an option or an override
-        return not is_other and before[:1] != "-" and Path(word).is_dir()
+        is_alone = name in KEYS and not is_other and before[:1] != "-"
+        found += _with_key(name, word) if is_alone else [word]
+    if name == "report" and any(one.startswith("run=") for one in found):
+        found += [] if any(one.startswith("kind=") for one in found) else ["kind=run"]
+    return found
 
-    pairs = zip(arguments, ["", *arguments])
-    return [f"{key}={word}" if is_bare(word, before) else word for word, before in pairs]
+
+def _with_key(name: str, word: str) -> list[str]:
+    """Return the override that a word typed alone stands for, or itself, if it is no file and no folder."""
+    path, key = Path(word), KEYS[name]
+    if key == "video":
+        if path.is_dir() and name == "capture":
+            inner = [one for one in path.iterdir() if not one.name.startswith(".")]
+            of_cameras = any(map(_is_film, inner)) or (inner and all(map(Path.is_dir, inner)))
+            return [f"{'videos' if of_cameras else 'images'}={word}"]
+        return [f"video={word}"] if path.exists() or _is_film(path) else [word]
+    if _is_film(path):
+        expected = f"{word}: expected the folder of a run, but got a film"
+        raise ValueError(f"{expected}; type forewarp-open {quote(word)}")
+    places = [path, *(Path(root) / path for root in RESULTS if key == "run" and not path.is_absolute())]
+    if (place := next((one for one in places if one.is_dir()), None)) is None:
+        return [word]
+    runs = next((made for mark in _OF_RUN if (made := sorted(place.glob(mark)))), [])
+    if not runs and (layout := layout_of(place)) is not None:
+        scene, way = place.resolve(), LAYOUTS[layout][1]
+        if way.startswith("experiment="):
+            way = f"forewarp-train {way} data.root={quote(str(scene.parent))} data.scene={quote(scene.name)}"
+        raise ValueError(f"{word}: expected the folder of a run, but got a scene; type {way}")
+    if len(runs) > 1 and name not in ("export", "report"):  # which take those of a film's windows, and tables
+        names = ", ".join(str(run.parent) for run in runs[:3]) + ", ..." * (len(runs) > 3)
+        raise ValueError(f"{word}: expected one run, but got {len(runs)}; type {key}= and one of {names}")
+    key = "runs" if name == "report" and len(runs) != 1 else key
+    return [f"{key}={runs[0].parent if len(runs) == 1 and runs[0].parent != path else word}"]
+
+
+def _is_film(path: Path) -> bool:
+    kind = mimetypes.guess_type(path.name)[0] or ""
+    return not path.is_dir() and (kind.startswith("video/") or path.suffix.lower() == ".r3d")
 
 
 def refuse_dashes(arguments: list[str]) -> None:
@@ -113,7 +164,11 @@ def unknown_key(error: Exception, name: str, arguments: list[str]) -> str | None
             if key.replace("/", ".") in _every_key(_composed(name, of_model)):
                 return of_another(key, config.model.name, model)
     groups = option_groups(configurations(), *installed().values())
-    near = difflib.get_close_matches(key, [*keys, *groups], 1, cutoff=0.8)
+    # The last part of a key, as minutes of budget.minutes, of which the shortest is meant.
+    inner = sorted(
+        (one for one in keys if one.endswith(f".{key}")), key=lambda one: (one.count("."), len(one))
+    )
+    near = difflib.get_close_matches(key, [*keys, *groups], 1, cutoff=0.8) or inner
     advice = f"did you mean {near[0]}?" if near else f"forewarp-{name} --cfg job prints all keys"
     return f"{key}: expected a key of the configuration, but got none of this name; {advice}"
 
@@ -269,7 +324,8 @@ def _of_hydra(said: str) -> str | None:
     known = option_groups(configurations(), *installed().values()).get(group, [])
     if known and "Available" not in said:
         said += f" Available options in '{group}': {'; '.join(known)}"
-    near = difflib.get_close_matches(word, [*known, *re.findall(r"^\t(\S+)$", text, re.M)], 1)
+    options = [*known, *re.findall(r"^\t(\S+)$", text, re.M)]
+    near = [one for one in options if one.startswith(word)] or difflib.get_close_matches(word, options, 1)
     return said + (f"; did you mean {near[0]}?" if near else "")
 
 

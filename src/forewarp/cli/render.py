@@ -34,6 +34,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from forewarp.cli.entry import command
+from forewarp.runs.overrides import next_command
 
 HALF = 0.5  # share of a pixel, above which it counts as what fills it
 _FRAMES, _MOST_FRAMES = 60, 1200  # of a video whose length nothing tells, and at most without frames=
@@ -124,8 +125,12 @@ def check(config) -> None:
     from forewarp.drawing.images import FORMATS
     from forewarp.evaluation.images import PATHS
     from forewarp.evaluation.layers import LAYERS
+    from forewarp.export.formats import FORMATS as OF_EXPORT
 
-    for key, known in (("path", PATHS), ("format", FORMATS), ("layer", LAYERS)):
+    page = next_command("export", [f"run={config.run or '<a run>'}", f"format={config.format}"])
+    exported = f"it is written by {page}" if config.format in OF_EXPORT else ""
+    one_of(config.format, "format", *FORMATS, advice=exported)
+    for key, known in (("path", PATHS), ("layer", LAYERS)):
         if config[key] is not None or key != "path":
             one_of(config[key], key, *known)
     config.masks = str(config.masks).lower()  # typed, it is text, as the folder of forewarp-capture is

@@ -29,7 +29,7 @@ What one types most:
   target=DB              accuracy_time: PSNR that every variant's seconds are listed for
   published=FILE         accuracy_time, minutes: results of others; paper, ablation: the printed numbers
   curves=FOLDER          paper: where accuracy_time put its pictures (runs/accuracy_time/results)
-  run=FOLDER             run: the run; its page is <run>/page.html, or out=FILE.html
+  run=FOLDER             the run (kind=run is then meant); its page is <run>/page.html, or out=FILE.html
   megabytes=N            run: most of the page; pictures and the video are made smaller to fit
   render=false           run: show only what the folder has; load no method and no data; for slow methods
   path=as_filmed|lean|both|fixed|...   run: which video, as in forewarp-render
@@ -54,6 +54,8 @@ from forewarp.cli.entry import command
 from forewarp.cli.mistakes import one_line
 from forewarp.cli.render import write_film
 from forewarp.data.files import number, one_of
+from forewarp.files import link_of
+from forewarp.progress import told_if_slow
 from forewarp.runs.config_files import project_root
 
 # Where the runs of a kind are if none are named, what writes its page, and the options that it takes.
@@ -97,7 +99,8 @@ def report(config: DictConfig) -> None:
         options = {name: typed[name] for name in names}
         out = Path(config.out or (runs.parent if runs.suffix == ".csv" else runs / "results"))
         write = resolve_name(f"forewarp.report.{function}")
-        print(*(f"written: {file}" for file in write(runs, out, **options)), sep="\n")
+        for file in write(runs, out, **options):
+            print(f"written: {file}", *([link_of(file)] if Path(file).suffix == ".html" else []), sep="\n")
 
 
 def tabled(config: DictConfig) -> str:
@@ -172,7 +175,8 @@ def run_page(config: DictConfig) -> str:
     def written() -> str:
         size = write_run_page(file, row, media, megabytes=most)
         told = media.diagnosis.lines() if media.diagnosis else []
-        return "\n".join([*media.missing, *told, f"written: {file}: {size / 1e6:.1f} of at most {most:g} MB"])
+        about = f"written: {file}: {size / 1e6:.1f} of at most {most:g} MB"
+        return "\n".join([*media.missing, *told, about, link_of(file)])
 
     media = media_of(row, config.path)  # loads torch; mistakes have been answered before
     room_of(row, media, most)  # refuses before minutes of rendering
@@ -203,21 +207,23 @@ def _render(config: DictConfig, row: dict, media) -> None:
     from forewarp.runs.fitted import method_name, opened
 
     saved = saved_config(str(row["folder"]), config)
-    run, module = opened(saved)
-    targets = run.datamodule.targets("test")
-    _diagnose(row, media, run, module)
+    with told_if_slow("page", "looking where the error is", after=1.0):
+        run, module = opened(saved)
+        targets = run.datamodule.targets("test")
+        _diagnose(row, media, run, module)
     places = {frame.name: number for number, frame in enumerate(targets.frames)}
     views = []
-    for name, why in best_median_worst(row["images"]).items():
-        if name in places:
-            target = targets[places[name]]
-            side = max(target.frame.camera.width, target.frame.camera.height)
-            views.append(Shown(why, about(row, name), parts_of(module, target, MOST_SIDE), side))
+    with told_if_slow("page", "rendering the best, the median and the worst view", after=1.0):
+        for name, why in best_median_worst(row["images"]).items():
+            if name in places:
+                target = targets[places[name]]
+                side = max(target.frame.camera.width, target.frame.camera.height)
+                views.append(Shown(why, about(row, name), parts_of(module, target, MOST_SIDE), side))
     media.views = views or media.views
     if config.path is None and isinstance(module.method, HasMovingGaussians):
         from forewarp.export.html import player_of, script_digests
 
-        with suppress(ValueError):  # of particles of which nobody sees any
+        with told_if_slow("page", "writing the player", after=1.0), suppress(ValueError):  # nobody sees any
             text, _ = player_of(source_of(run, module, method_name(saved), []))
             if media.play(text, script_digests(), room_of(row, media, float(config.megabytes))):
                 return

@@ -64,10 +64,10 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from shlex import quote
 
 from forewarp.cli.entry import command
 from forewarp.runs.cost import clocks
+from forewarp.runs.overrides import next_command
 
 # Of a profiler's table: action, calls, seconds in all. The row of the total has no mean.
 _ROW = re.compile(r"^\|\s+(\S.*?)\s*\|\s+\d\S*\s*\|\s+(\d+)\s*\|\s+(\d\S*)\s*\|", re.M)
@@ -91,8 +91,8 @@ def train(config) -> float | None:
     with prepared.session():
         if prepared.measured:
             folder, reduce = prepared.run.folder, prepared.config.get("reduce")
-            words = quote(f"run={folder}") + (f" reduce={reduce}" if reduce else "")
-            print(f"measured before: {folder}; again with forewarp-evaluate {words}")
+            words = [f"run={folder}", *([f"reduce={reduce}"] if reduce else [])]
+            print(f"measured before: {folder}; again with", f"  {next_command('evaluate', words)}", sep="\n")
             return prepared.score.of()
         print(beginning(prepared.run, prepared.config), flush=True)
         is_new = not any(prepared.run.folder.glob("*/last.ckpt"))
@@ -130,20 +130,20 @@ def keep_cost(prepared, moments: Sequence[Mapping[str, float]]) -> None:
 
 def measure(prepared, module) -> float | None:
     """Measure a fitted run, or say how to; draw its curve; return the score."""
-    from forewarp.evaluation.evaluate import notes_of
+    from forewarp.methods.method import HasMovingGaussians
     from forewarp.report.figures import draw_own
     from forewarp.runs.build import PROFILE
     from forewarp.runs.fitted import doubts_of, log_film, log_scores, measure_run, tell, training_psnr
 
     run, config = prepared.run, prepared.config
+    of_run = f"run={run.folder}"
     if config.evaluate:
         metrics = measure_run(run, module, config)
         log_scores(run, metrics)
         if (config.get("trackers") or {}).get("film"):
             log_film(run, module, metrics)
     else:
-        fitted = f"fitted: {run.folder}; measure it with forewarp-evaluate {quote(f'run={run.folder}')}"
-        print(fitted, *notes_of(module.method.protocol()), sep="\n")
+        print(f"fitted: {run.folder}; measure it with", f"  {next_command('evaluate', [of_run])}", sep="\n")
         tell(doubts_of(config, run, module.to(run.device)))
     if config.get("debug") == "overfit":
         reached, one_color = training_psnr(run, module.to(run.device))
@@ -154,8 +154,12 @@ def measure(prepared, module) -> float | None:
         print(f"profile  {file}", *costliest(file.read_text("utf-8")), sep="\n")
     draw_own(run.folder)
     if config.evaluate:
-        at = quote(f"run={run.folder}")
-        print(f"look at  forewarp-view {at}, or a page: forewarp-report kind=run {at}")
+        plays = isinstance(module.method, HasMovingGaussians)
+        shown = [("a page that plays it offline", "export", [of_run, "format=html"])] if plays else []
+        shown += [("fly around it", "view", [of_run])]
+        shown += [("its scores and worst views, and what to try", "report", ["kind=run", of_run])]
+        for what, name, words in shown:
+            print(f"{what}:", f"  {next_command(name, words)}", sep="\n")
     score = prepared.score.of(module)
     for name, noted in run.finished().items():
         if steps := noted.get("skipped_steps"):

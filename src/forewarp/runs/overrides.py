@@ -5,8 +5,11 @@ from __future__ import annotations
 import os
 import re
 import shlex
+import shutil
+import sys
 from collections.abc import Sequence
 from contextlib import suppress
+from pathlib import Path
 
 # Keys that hold a path, the name of a scene's folder, or a regular expression, which is always one value;
 # those in which a list of paths may stand.
@@ -42,6 +45,19 @@ def typed_folders() -> list[str]:
     typed = [source.path for source in hydra.runtime.config_sources if source.provider == "command-line"]
     searched = [one for one in hydra.overrides.hydra if key_of(one) == "hydra.searchpath"]
     return [*(f"--config-dir={path}" for path in typed), *searched]
+
+
+def next_command(name: str, overrides: Sequence[str]) -> str:
+    """Quote a command to be typed next: its program by the path of this one's, ``.venv/bin/forewarp-view``,
+    or by its name where that is found.
+    """
+    program = Path(sys.argv[0])
+    found = shutil.which(f"forewarp-{name}")
+    beside = program.absolute().with_name(f"forewarp-{name}")
+    if not program.name.startswith("forewarp-") or len(program.parts) == 1 or found == str(beside):
+        return command_line(name, overrides)
+    near = beside.relative_to(Path.cwd()) if beside.is_relative_to(Path.cwd()) else beside
+    return shlex.join([str(near), *overrides])
 
 
 def command_line(name: str, overrides: Sequence[str]) -> str:
