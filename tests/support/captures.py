@@ -13,8 +13,9 @@ from scipy.spatial.transform import Rotation
 from forewarp.capture.poses import Reconstruction
 from forewarp.scene.camera import Camera, Lens, look_at
 from forewarp.synth.raycast import render_all
-from forewarp.synth.walks import Walk
+from forewarp.synth.walks import Walk, cameras_of
 from forewarp.synth.world import World
+from tests.support.films import write_film
 
 
 def quiet(done, total):
@@ -48,6 +49,14 @@ def pictures_of(walk: WorldWalk, times, cameras, *, samples: int = 2, workers=No
     views = [(world, float(time), camera) for time, camera in zip(times, cameras)]
     for rgba, _ in render_all(views, samples, workers, progress, shadow_rays=1):
         yield rgba[..., :3]
+
+
+def hand_film(file, count=20, size=(240, 180)):
+    """Write a hand-held film of the room; return its file and its true cameras."""
+    walk, times = WALKS["room"], np.linspace(0, 1, count)
+    cameras = cameras_of(walk, times, 4.0, size=size)
+    images = np.stack(list(pictures_of(walk, times, cameras, samples=1, workers=1)))
+    return write_film(file, images, stamps="N*(N+30)*3"), cameras
 
 
 def smeared(picture: np.ndarray, length: int) -> np.ndarray:
