@@ -41,7 +41,7 @@ def device_for(config: DictConfig) -> torch.device:
 
 
 def why_on_cpu(config: DictConfig) -> str | None:
-    """Say in a line why ``trainer=auto`` runs on the CPU beside a GPU; None where it does not, or there is none."""
+    """Say in a line why ``trainer=auto`` runs on the CPU beside a GPU; None without a reason or a GPU."""
     import torch
 
     if config.trainer.accelerator != "auto" or not torch.cuda.is_available():
