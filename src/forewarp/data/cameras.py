@@ -206,6 +206,7 @@ def space_of(
     normalise: bool = True,
     cut_out: bool = False,
     radius: float = 1.0,
+    metric: bool = False,
 ) -> tuple[Normalisation, Box]:
     """Find the part of the world that cameras of unknown scale look at: how to normalise it, and its box.
 
@@ -217,6 +218,7 @@ def space_of(
         cut_out: the images are cut out; then the box holds only what they show around the focus.
         normalise: put the focus at the origin and the farthest camera at distance ``radius``.
         radius: see ``normalise``.
+        metric: normalise as ``near_origin`` alone: the unit of length stays.
 
     Raises:
         SceneError: where something cannot be derived from the cameras.
@@ -227,8 +229,10 @@ def space_of(
         expected = f"cameras within {_FAR_AWAY * far:.3g} units of the origin with data.normalise=false"
         advice = "set data.normalise=true (exports are in the file's world), or move the origin"
         raise mismatch(where, expected, f"{float(focus.norm()):.4g}, too far for single precision", advice)
-    size = max(float((camera.center - focus).norm()) for camera in cameras) / radius if normalise else 1.0
-    center = tuple(focus.tolist()) if normalise else (0.0, 0.0, 0.0)
+    size, center = 1.0, near_origin(focus.tolist(), far).center
+    if normalise and not metric:
+        size = max(float((camera.center - focus).norm()) for camera in cameras) / radius
+        center = tuple(focus.tolist())
     space = Normalisation(center, 1 / size, near / size, far / size)
 
     def moved(box: Box) -> Box:
@@ -246,6 +250,17 @@ def space_of(
     except ValueError as error:
         advice = "set data.near, data.far and data.box"
         raise mismatch(where, "cameras that see a part of space", f"none ({error})", advice) from error
+
+
+def near_origin(place: Sequence[float], far: float) -> World:
+    """Return the world whose origin is at a place, in whole units of the data's, if that is too far from the
+    data's origin for single precision, which moves what is seen there; else the data's world.
+
+    >>> near_origin((456012.3, 4650123.7, 81.2), 10.0).center, near_origin((30.0, 4.0, 0.5), 10.0).is_same
+    ((456012.0, 4650124.0, 81.0), True)
+    """
+    is_far = math.dist(place, (0.0, 0.0, 0.0)) > _FAR_AWAY * far
+    return World(tuple(float(round(value)) for value in place)) if is_far else World()
 
 
 def _focus(cameras: list[Camera], near: float | None, far: float | None, where: str) -> tuple[Tensor, Tensor]:

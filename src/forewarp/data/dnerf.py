@@ -119,9 +119,9 @@ def read_scene(
     """Read ``root/scene``; pixels are decoded when a frame is first loaded.
 
     Where all cameras are about 4 from the origin, as in the published scenes, the world stays as it is. Else
-    what the cameras look at is moved to the origin and the farthest camera to distance 4, unless depth or
-    trajectories come with the scene. Frames without an image are left out and counted; without test images
-    training images are held out.
+    what the cameras look at is moved to the origin and the farthest camera to distance 4; where depth or
+    trajectories come with the scene, the unit stays, and the origin, too, unless it is far away. Frames
+    without an image are left out and counted; without test images training images are held out.
 
     Args:
         half_resolution: average 2 x 2 pixels; "auto" does so where images are wider than 400, as published.
@@ -182,7 +182,7 @@ def read_scene(
     is_moved = space.scale != 1 or any(space.center)
     protocol |= {"test_frames": len(test), "normalisation": space.told if is_moved else None}
     protocol["assumed"] = [*dict.fromkeys(assumed)] or None
-    truth = read_truth(folder / "trajectories.npz", canonical)
+    truth = read_truth(folder / "trajectories.npz", canonical, space)
     return Scene(scene, train, val, test, bounds, canonical, has_alpha, truth, protocol, world=space)
 
 
@@ -206,7 +206,7 @@ def _space(
     as_published = all(_LEAST_DISTANCE < distance < _MOST_DISTANCE for distance in distances)
     given = None if box == "auto" else box_of(box)
     if not as_published:
-        options = {"near": near, "far": far, "box": given, "normalise": not is_metric, "cut_out": cut_out}
+        options = {"near": near, "far": far, "box": given, "metric": is_metric, "cut_out": cut_out}
         return space_of(cameras, where, **options, radius=_RADIUS)
     near, far = _NEAR if near is None else near, _FAR if far is None else far
     if not near < far:

@@ -30,7 +30,15 @@ from torch import Tensor
 
 from forewarp.data import files
 from forewarp.data.arrays import read_cloud, read_truth, write_array, write_truth
-from forewarp.data.cameras import MOST_UNITS, Normalisation, box_of, check_camera, frustum_box, pose_of
+from forewarp.data.cameras import (
+    MOST_UNITS,
+    Normalisation,
+    box_of,
+    check_camera,
+    frustum_box,
+    near_origin,
+    pose_of,
+)
 from forewarp.data.depth import METRIC, SensedDepth, depths_beside, doubt_depths, unit_of
 from forewarp.data.directions import by_translation, opposite, other_readings, transposed
 from forewarp.data.files import (
@@ -224,6 +232,11 @@ def read_scene(
     assumed += side_files(
         [folder, images], known, "set data.depth (data=iphone) for depth, cut masks into alpha"
     )
+    middle = torch.stack([f.camera.center for f in train]).mean(0).tolist()
+    if not near_origin(middle, far).is_same:
+        place = [round(value, 1) for value in torch.stack(poses)[:, :3, 3].mean(0).tolist()]
+        got = f"{center}, with cameras around {place}, too far from it for single precision"
+        raise mismatch(world.where("center"), "the middle of what is filmed", got, "write that")
     if ways := other_readings(poses, _READINGS):
         line = "cameras do not look at one thing, as all of them do if"
         assumed.append(f"{folder / 'camera'}: {line} {', or if '.join(ways)}; if so, write them anew")

@@ -10,7 +10,7 @@ with gaps: they are taken in order. Beside them there may be ``trajectories.npz`
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -18,7 +18,7 @@ import numpy as np
 import torch
 
 from forewarp.data.arrays import read_cloud, read_truth, shortened, write_array, write_truth
-from forewarp.data.cameras import box_of, check_camera, pose_of
+from forewarp.data.cameras import box_of, check_camera, near_origin, pose_of
 from forewarp.data.directions import inverted, opposite, refuse_other_readings
 from forewarp.data.files import SceneError, mismatch, numbers_of, one_of, opened, remove, scene_folder, whole
 from forewarp.data.images import StoredImage, by, check_pixels, exif_turned, inspect_image, write_image
@@ -106,6 +106,9 @@ def read_scene(
     for number, camera in enumerate(cameras):
         where = f"{folder / 'Intrinsic.inf'}: camera {number}"
         check_camera(camera, where, where)
+    world = near_origin(bounds.center, max(camera.far for camera in cameras))
+    cameras = [replace(c, camera_to_world=world.to_scene(c.camera_to_world)) for c in cameras]
+    bounds = Box(*world.to_scene(np.array([bounds.low, bounds.high])).tolist())
 
     def view(f: int, k: int) -> Frame:
         place, name = places[f], names[k]
@@ -127,14 +130,15 @@ def read_scene(
         "views": len(poses),
         "test_views": held,
         "test_frames": len(test),
+        "normalisation": None if world.is_same else {"center": list(world.center), "scale": world.scale},
         "mask_box": True,
         "test_moments": sorted(held_times) or None,
         "assumed": [*assumed, *exif_turned(turned, folder / "img")] or None,
     }
-    truth = read_truth(folder / "trajectories.npz", 0.0)
+    truth = read_truth(folder / "trajectories.npz", 0.0, world)
     if truth is not None and moments < len(places):  # the file's times are those of all frames on disk
         truth = shortened(truth, (numbers[-1] - numbers[0]) / (on_disk[-1] - on_disk[0]))
-    return Scene(scene, train, (), test, bounds, 0.0, True, truth, protocol)
+    return Scene(scene, train, (), test, bounds, 0.0, True, truth, protocol, world=world)
 
 
 def write_scene(
