@@ -165,6 +165,23 @@ def test_no_process_that_is_started_imports_of_the_current_folder(in_tmp):
     assert not os.path.exists("trace")
 
 
+TYPED = """
+from forewarp.cli.entry import quiet
+quiet()
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
+with ProcessPoolExecutor(1, get_context("spawn")) as pool:
+    pool.submit(eval, "__import__('planted')").exception()
+"""
+
+
+def test_workers_of_typed_code_import_nothing_of_the_current_folder(in_tmp):
+    """Where the first place to import from is the current folder, whatever it is: an empty text."""
+    Path("planted.py").write_text("open('trace', 'w')\n")
+    subprocess.run([sys.executable, "-c", TYPED], capture_output=True, check=True)
+    assert not os.path.exists("trace")
+
+
 @pytest.mark.slow
 def test_a_helper_process_imports_nothing_of_the_current_folder(in_tmp, monkeypatch):
     from forewarp.methods.particles import start
