@@ -140,10 +140,14 @@ def test_particles_play_in_it_by_the_player_s_own_scripts_alone(browser, tmp_pat
     text, _ = player_of(source)
     media, page = Media(), tmp_path / "page.html"
     assert not media.play(text, script_digests(), 1e5)
-    assert media.play(text, script_digests(), 1e6)
+    assert media.play(text, script_digests(), 1e6, torch.rand(20, 40, 3), framed=True)
     write_run_page(page, read_story(told_run(tmp_path)), media, megabytes=1)
     tab = Tab(browser, None, width=900)
     tab.page.goto(page.as_uri())
+    frame = tab.page.locator("iframe")
+    box = frame.bounding_box()
+    assert box["width"] / box["height"] == pytest.approx(2, rel=0.02)
+    assert 'url("data:image/jpeg' in frame.evaluate("(frame) => getComputedStyle(frame).backgroundImage")
     inner = tab.page.frames[1]
     assert inner.evaluate("forewarp.then((door) => door.settled()).then(() => document.title)") == "</iframe>"
     until(lambda: inner.evaluate("forewarp.then(({player}) => player.time > 0)"))

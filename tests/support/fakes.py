@@ -23,7 +23,7 @@ class Watch:
 class FakeViewer:
     """Renders grey images; each takes ``cost`` seconds a pixel, of a clock that stands otherwise."""
 
-    rows, aspect, note, can_follow = 400, 1.0, "", True
+    rows, aspect, note, can_follow, film, seconds = 400, 1.0, "", True, None, 4.0
 
     def __init__(self, watch=None, cost=0.0):
         self.watch, self.cost, self.scene = watch or Watch(), cost, ball_scene(frames=4)
@@ -45,6 +45,9 @@ class FakeViewer:
                 raise Cancelled
         return torch.full((height, width, 3), state.time)
 
+    def beyond(self, state):
+        return 0.0
+
     def point_at(self, state, x, y, width, height):
         return None if x > 0.9 else (x, y, 0.0)
 
@@ -54,12 +57,16 @@ class FakePage:
 
     def __init__(self):
         self.images, self.said, self.times, self.plays = [], [], [], []
+        self.gone = 0
 
     def canvas(self):
         return CANVAS
 
     def show_image(self, image, *, rest):
         self.images.append((tuple(image.shape[:2]), rest, round(float(image[0, 0, 0]), 3)))
+
+    def let_go(self):
+        self.gone += 1
 
     def show_splats(self, ellipsoids):
         self.images.append(ellipsoids)

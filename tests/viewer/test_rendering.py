@@ -4,6 +4,7 @@ import pytest
 import torch
 
 from forewarp.scene.camera import look_at
+from forewarp.scene.film import FilmPath
 from forewarp.scene.view import Moment, View
 from forewarp.viewer import rendering
 from forewarp.viewer.queue import Cancelled
@@ -235,3 +236,21 @@ def test_two_runs_have_one_camera_each_their_half_and_rows_of_their_own(data, st
     assert float((torch.tensor(still) - ball_center(0.0)).norm()) == pytest.approx(0.4, abs=0.08)
     wide, narrow = (viewer._camera(state, width, SIZE) for width in (2 * SIZE + 4, SIZE))
     assert narrow.fx == pytest.approx(wide.fx * narrow.width / SIZE)  # sees what a square would
+
+
+def test_a_film_keeps_its_frame_and_an_edge_shows_where_it_is_left(data):
+    viewer = Viewer(data.scene, [SceneRenderer("ball", known_ball(), data)])
+    cameras = [camera_at(0.02 * i).resized(24, 12) for i in range(9)]
+    viewer.film = FilmPath.of(cameras, [i / 8 for i in range(9)])
+    first = viewer.film.at(0.5)
+    riding = ViewState(first.camera_to_world, 0.5, time=0.5, lean=(0.0, 0.0))
+    image = image_of(viewer, riding)
+    own = viewer.renderers[0].image(riding, first.resized(SIZE, SIZE // 2))
+    assert torch.equal(image[SIZE // 4 : 3 * SIZE // 4], own)
+    assert float(image[: SIZE // 4].max()) < 0.1  # letterbox
+    assert viewer.beyond(riding) == 0
+    free = replace(riding, lean=None)
+    assert viewer.beyond(free) == 0
+    aside = replace(free, pose=camera_at(0.3).camera_to_world)
+    assert viewer.beyond(aside) > 60
+    assert image_of(viewer, aside)[0, 0].tolist() == pytest.approx([1.0, 0.72, 0.42])

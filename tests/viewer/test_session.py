@@ -6,9 +6,10 @@ from time import monotonic
 import pytest
 import torch
 
+from forewarp.scene.film import FilmPath
 from forewarp.viewer import session as session_module
 from forewarp.viewer.queue import FRAME_SECONDS, Cancelled, RenderQueue
-from forewarp.viewer.session import MIN_INTERVAL, PLAYBACK_SECONDS, REST_SECONDS, Session, camera_path
+from forewarp.viewer.session import LEAN_SECONDS, MIN_INTERVAL, REST_SECONDS, Session, camera_path
 from tests.support.fakes import FakePage, FakeViewer, Watch
 from tests.support.films import read_film
 from tests.support.tiny_scene import camera_at
@@ -126,9 +127,9 @@ def test_another_speed_or_time_goes_on_from_where_time_is(viewer, watch):
     session, page = session_of(viewer)
     session.change(time=0.2)
     session.play(True)
-    watch.now += 0.1 * PLAYBACK_SECONDS
+    watch.now += 0.1 * viewer.seconds
     session.set_speed(2.0)
-    watch.now += 0.1 * PLAYBACK_SECONDS
+    watch.now += 0.1 * viewer.seconds
     session.change(fov=0.5)
     run(viewer, 1)
     assert page.times == [pytest.approx(0.3), pytest.approx(0.5, abs=0.01)]
@@ -317,3 +318,23 @@ def test_an_image_is_no_wider_than_a_screen_whatever_a_browser_tells():
     ):
         session.page.canvas = lambda canvas=canvas: canvas
         assert session.full_size() == size
+
+
+def test_a_lean_from_a_film_springs_back_after_a_moment(viewer, watch):
+    viewer.film = FilmPath.of([camera_at(0.02 * i) for i in range(9)], [i / 8 for i in range(9)])
+    session, page = session_of(viewer)
+    assert session.state.lean == (0.0, 0.0)
+    session.lean(40.0, 5.0, 1.5)
+    run(viewer)
+    camera = replace(viewer.film.at(0.0), camera_to_world=session.state.pose)
+    assert 7 < viewer.film.beside(camera, 0.0) < 8.001
+    assert page.gone == 0
+    watch.now += LEAN_SECONDS
+    for _ in range(30):
+        run(viewer)
+        watch.now += REST_SECONDS
+    assert page.gone > 0
+    assert (session.state.lean, session.state.zoom) == ((0.0, 0.0), 1.5)
+    session.change(time=0.5)
+    run(viewer)
+    torch.testing.assert_close(session.state.pose, viewer.film.at(0.5).camera_to_world)

@@ -221,11 +221,13 @@ def _render(config: DictConfig, row: dict, media) -> None:
                 views.append(Shown(why, about(row, name), parts_of(module, target, MOST_SIDE), side))
     media.views = views or media.views
     if config.path is None and isinstance(module.method, HasMovingGaussians):
-        from forewarp.export.html import player_of, script_digests
+        from forewarp.export.html import player_of, poster, script_digests
 
         with told_if_slow("page", "writing the player", after=1.0), suppress(ValueError):  # nobody sees any
-            text, _ = player_of(source_of(run, module, method_name(saved), []))
-            if media.play(text, script_digests(), room_of(row, media, float(config.megabytes))):
+            source = source_of(run, module, method_name(saved), [])
+            text, _ = player_of(source)
+            room = room_of(row, media, float(config.megabytes))
+            if media.play(text, script_digests(), room, poster(source), source.is_film):
                 return
     if media.video is not None:
         return

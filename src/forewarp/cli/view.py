@@ -51,6 +51,7 @@ def view(config) -> None:
         runs.append(saved_config(config.run2, config, "run2"))
     refuse_numbers(config, "size", "points", "tail")
     # These load torch; mistakes have been answered before.
+    from forewarp.runs.fitted import trust_degrees
     from forewarp.viewer.rendering import Viewer
     from forewarp.viewer.server import serve
 
@@ -58,7 +59,7 @@ def view(config) -> None:
     scene = renderers[0].scene
     for other in renderers[1:]:
         refuse_other_scene(scene, other.scene)
-    viewer = Viewer(scene, renderers, rows=config.size)
+    viewer = Viewer(scene, renderers, rows=config.size, trust=trust_degrees(Path(config.run)))
     title = " | ".join([scene.name, *(renderer.name for renderer in renderers)])
     folder = Path(config.run) / "videos"
     with serve(viewer, host=config.host, port=config.port, title=title, folder=folder) as address:

@@ -45,6 +45,7 @@ DRAWN, LISTED, LOSSES = 400, 1000, 150  # at most: views in a chart and in the t
 PICTURES = 0.6  # share of the room that pictures may take; the video has the rest
 LADDER = ((800, 92), (640, 90), (480, 88), (320, 80), (200, 70), (120, 60))  # most pixels of a side, quality
 THUMB, SMALL = (96, 70), (240, 80)  # of the choice of a view, and of those that are listed as the worst
+_POSTER = 320, 60  # of what is shown until the player has come: most pixels of a side, quality
 NOTES = 1000  # bytes that are kept for what the page says about sizes
 
 
@@ -67,7 +68,8 @@ class Media:
 
     ``diagnosis`` says where the error is, and ``worst`` shows the views that it lists, each ``why`` its name.
     A ``player`` is a page that plays the scene, shown in place of a video; ``scripts`` are the hashes of its
-    scripts, as a policy names them.
+    scripts, as a policy names them; ``poster`` is the address of a small image, shown until the player has
+    come, and ``shape`` the player's width by its height.
     """
 
     views: Sequence[Shown] = ()
@@ -76,14 +78,35 @@ class Media:
     missing: Sequence[str] = ()
     player: str = ""
     scripts: Sequence[str] = ()
+    poster: str = ""
+    shape: float = 1.0
     diagnosis: Diagnosis | None = None
     worst: Sequence[Shown] = ()
 
-    def play(self, player: str, scripts: Sequence[str], room: float) -> bool:
-        """Take a player in place of a video, if it is no larger than a video's share of ``room`` bytes."""
+    def play(
+        self,
+        player: str,
+        scripts: Sequence[str],
+        room: float,
+        poster: Tensor | None = None,
+        framed: bool = False,
+    ) -> bool:
+        """Take a player in place of a video, if it is no larger than a video's share of ``room`` bytes.
+
+        Args:
+            player, scripts: see the class.
+            room: see ``room_of``.
+            poster: what it begins with, (H, W, 3) in [0, 1].
+            framed: it has the poster's shape, not a square one.
+        """
+        from forewarp.drawing.images import at_most, jpeg_bytes
+
         if len(escape(player).encode()) > (1 - PICTURES) * room:
             return False
         self.player, self.scripts, self.video = player, scripts, None
+        if poster is not None:
+            self.poster = _address("image/jpeg", jpeg_bytes(at_most(poster.cpu(), _POSTER[0]), _POSTER[1]))
+            self.shape = poster.shape[1] / poster.shape[0] if framed else 1.0
         return True
 
 

@@ -14,6 +14,7 @@ from forewarp.scene.camera import Camera, focus_point
 from forewarp.scene.frame import Scene
 
 TRUST_DEGREES = 8.0  # of a film whose run has not measured it
+LEAST_DEGREES = 2.0  # that every film holds
 # Between images of a path that one camera went: least cosine, and most of the distance to what it looks at.
 _STEADY, _STEP = math.cos(0.5), 0.5
 _SMOOTHED = 0.08  # standard deviation of a stabilised path's mean, as a share of the film
@@ -59,7 +60,8 @@ class FilmPath:
             step = float((after.center - before.center).norm())
             if turn < _STEADY or step > _STEP * float((focus - before.center).norm()):
                 return None
-        return cls(tuple(cameras), tuple(times), focus, TRUST_DEGREES if degrees is None else degrees)
+        degrees = max(TRUST_DEGREES if degrees is None else degrees, LEAST_DEGREES)
+        return cls(tuple(cameras), tuple(times), focus, degrees)
 
     def at(self, time: float) -> Camera:
         """Return where the camera was at a time, between the two images nearest to it."""
@@ -91,15 +93,30 @@ class FilmPath:
         """Turn a camera about its pivot by degrees to the right and upwards."""
         return leaned(camera, self.pivot(camera), across, upward)
 
-    def within(self, camera: Camera, time: float) -> Camera:
-        """Bring a camera so near to where the film's was at a time that it is within the trusted angle."""
+    def beside(self, camera: Camera, time: float) -> float:
+        """Return the degrees between a camera and the film's at a time, seen from the latter's pivot."""
         filmed = self.at(time)
         pivot = self.pivot(filmed)
         start, end = filmed.center - pivot, camera.center - pivot
-        away = math.degrees(math.acos(max(-1.0, min(1.0, float(start @ end / (start.norm() * end.norm()))))))
+        cosine = float(start @ end / (start.norm() * end.norm()))
+        return math.degrees(math.acos(max(-1.0, min(1.0, cosine))))
+
+    def leant(self, time: float, across: float, upward: float) -> Camera:
+        """Return where the film's camera was at a time, leant aside by degrees, however many, which come up
+        against the trusted angle.
+        """
+        pulled = math.hypot(across, upward)
+        share = self.degrees * math.tanh(pulled / self.degrees) / pulled if pulled else 0.0
+        return self.lean(self.at(time), share * across, share * upward)
+
+    def within(self, camera: Camera, time: float) -> Camera:
+        """Bring a camera so near to where the film's was at a time that it is within the trusted angle."""
+        away = self.beside(camera, time)
         if away <= self.degrees:
             return camera
-        share = self.degrees / away
+        filmed, share = self.at(time), self.degrees / away
+        pivot = self.pivot(filmed)
+        start, end = filmed.center - pivot, camera.center - pivot
         axis = normalize(torch.linalg.cross(start, end), dim=0)
         length = (1 - share) * start.norm() + share * end.norm()
         pose = _mean([filmed.camera_to_world, camera.camera_to_world], [1 - share, share])

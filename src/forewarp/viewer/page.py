@@ -29,7 +29,8 @@ _MOVED = 1e-3  # of the distance to the pivot: a camera that went farther has le
 _ARRIVAL = 0.5  # seconds in which a camera that was sent somewhere may still tell where it was
 _JPEG_QUALITY = {True: 92, False: 80}  # at rest and while moving
 _SPEEDS = ("0.1", "0.25", "0.5", "1", "2", "4")
-_MAX_CAMERAS = 200  # training cameras that are drawn
+_MAX_CAMERAS, _CAMERA_SIZE = 24, 0.02  # training cameras that are drawn, and their size by their distance
+_MOST_ZOOM = 4.0  # of a film's frame
 _FOLLOW = "follow the point that I click"
 _ABOUT_SPLATS = "*splats*: drawn by the browser, with one colour from all sides and no trajectories"
 
@@ -59,7 +60,7 @@ class Page:
         self._add_training_images()
         self._add_video()
         self.adapt()
-        if not self._is_wide:
+        if viewer.film is not None or not self._is_wide:
             self.go_home()
 
         @client.camera.on_update
@@ -138,7 +139,41 @@ class Page:
         """Stand where the first test image was taken, else the first training image, and show all of it."""
         camera = first_frame(self.viewer.scene).camera
         self.show_training_view(None)
-        self._stand_at(camera, fitted_fov(camera, *self.canvas()))
+        if self.viewer.film is not None:
+            self.fly(False)
+        else:
+            self._stand_at(camera, fitted_fov(camera, *self.canvas()))
+
+    def fly(self, freely: bool) -> None:
+        """Fly freely from where the page is, or ride along where the film's camera went."""
+        self.free.value = freely
+        self._show_cameras()
+        if freely:
+            state = self.session.state
+            camera = self.viewer.film.leant(state.time, *(state.lean or (0.0, 0.0)))
+            self._stand_at(camera, fitted_fov(camera, *self.canvas()))
+            self._change(lean=None, pose=camera.camera_to_world)
+        else:
+            self._change(lean=(0.0, 0.0), zoom=1.0)
+            self.let_go()
+
+    def let_go(self) -> None:
+        """Bring the browser's camera, whose turns lean the view, back to where it leans nothing."""
+        base = self.viewer.film.at(0.0)
+        self._sent = time.monotonic()
+        self._stand_at(base, vertical_fov(base))
+
+    def _lean(self, pose: Tensor) -> None:
+        """Lean as far as the browser's camera, ``pose`` (4, 4), was turned."""
+        base = self.viewer.film.at(0.0)
+        pivot, axes = self.viewer.film.pivot(base), base.camera_to_world[:3, :3]
+        right, down, ahead = (axes.T @ (pose[:3, 3] - pivot)).tolist()
+        away = math.hypot(right, down, ahead)
+        across = math.degrees(math.atan2(right, -ahead))
+        upward = math.degrees(math.asin(max(-1.0, min(1.0, -down / max(away, 1e-9)))))
+        zoom = float((base.center - pivot).norm()) / max(away, 1e-9)
+        self.session.lean(across, upward, min(max(zoom, 1.0), _MOST_ZOOM))
+        self._show_whether_compared()
 
     def _stand_at(self, of_image: Camera, fov: float) -> None:
         pose = of_image.camera_to_world
@@ -164,7 +199,12 @@ class Page:
             if arriving or not (shifted or turned):
                 self.session.refresh()  # the canvas may have another size
                 return
-        self._change(pose=pose, fov=float(camera.fov))
+        if self.session.state.lean is None:
+            self._change(pose=pose, fov=float(camera.fov))
+        elif time.monotonic() - self._sent < _ARRIVAL:
+            self.session.refresh()
+        else:
+            self._lean(pose)
 
     def _change(self, **changes) -> None:
         self.session.change(**changes)
@@ -180,7 +220,8 @@ class Page:
     def _show_cameras(self) -> None:
         """Show or hide the training cameras; nothing is sent before they are first shown."""
         with self._showing_cameras:  # threads of the server may come at once
-            visible = self.cameras_shown.value and self.session.state.training_view is None
+            flies = self.session.state.lean is None and self.session.state.training_view is None
+            visible = self.cameras_shown.value and flies
             if visible and not self._cameras:
                 indices = spread(len(self.viewer.scene.train), _MAX_CAMERAS)
                 self._cameras = [self._add_camera(index) for index in indices]
@@ -193,7 +234,7 @@ class Page:
         camera, color = frame.camera, hues(torch.tensor(0.8 * frame.time)).mul(255).int()
         turn = SO3.from_matrix(camera.camera_to_world[:3, :3].numpy()).wxyz
         shape = {"fov": vertical_fov(camera), "aspect": camera.width / camera.height}
-        shape["scale"] = 0.05 * float((camera.center - self.viewer.focus).norm())
+        shape["scale"] = _CAMERA_SIZE * float((camera.center - self.viewer.focus).norm())
         # A line alone is hard to hit.
         look = {"thickness": 1.5, "thickness_units": "screen", "variant": "filled", "visible": False}
         place = {"wxyz": turn, "position": camera.center.numpy(), "color": tuple(color.tolist())}
@@ -209,6 +250,8 @@ class Page:
             self.time = gui.add_slider("time", 0.0, 1.0, 0.001, round(session.state.time, 3))
             self.play = gui.add_button("play")
             home = gui.add_button("home")
+            is_film = self.viewer.film is not None
+            self.free = gui.add_checkbox("fly freely (R)", False, visible=is_film)
             speed = gui.add_dropdown("speed", _SPEEDS, initial_value="1")
             loop = gui.add_checkbox("loop", True)
 
@@ -220,6 +263,10 @@ class Page:
         on_edit(self.time, lambda time: self._change(time=float(time)))
         on_press(self.play, toggle)
         on_press(home, self.go_home)
+        on_edit(self.free, self.fly)
+        if is_film:
+            by_key = gui.add_command("fly freely, or along the film", hotkey="R")
+            by_key.on_trigger(lambda _: self.fly(not self.free.value))
         on_edit(speed, lambda speed: session.set_speed(float(speed)))
         on_edit(loop, lambda loop: setattr(session, "loop", loop))
 
@@ -245,7 +292,12 @@ class Page:
             scene.on_click()(clicked)
             self.follow.label = "now click a point"
 
-        on_edit(self.channel, lambda channel: self._change(channel=channel))
+        def show(channel: str) -> None:
+            self._change(channel=channel)
+            if channel == SPLATS and self.session.state.lean is not None:
+                self.fly(True)  # the browser draws them from its own camera
+
+        on_edit(self.channel, show)
         on_edit(self.layer, lambda layer: self._change(layer=layer))
         on_edit(self.trajectories, lambda shown: session.change(trajectories=shown))
         on_press(self.follow, wait_for_click)

@@ -17,6 +17,7 @@ from forewarp.evaluation.layers import LAYERS, layer_of
 from forewarp.evaluation.trajectories import Trajectories
 from forewarp.methods.method import HasEllipsoids, HasLayers, HasMatter, HasTrajectories, Method, Snapshot
 from forewarp.scene.camera import Camera, focus_point, mean_up
+from forewarp.scene.film import FilmPath
 from forewarp.scene.frame import Frame, Scene
 from forewarp.scene.view import Moment, Rendering, View
 from forewarp.training.module import DynamicSceneModule
@@ -29,6 +30,8 @@ _SNAPSHOTS = 2  # that are kept: of the time shown, and of the canonical time
 _PATHS, _POINTS = 4, 64  # sets of followed points that are kept, which pages share, and single ones
 _FOLLOWED = {"tail": 1.0, "width": 0.008}  # how the trajectory of a followed point is drawn
 _MIN_FULL_ROWS = 400  # rows of an image at rest, if the training images have fewer
+_SECONDS = 4.0  # in which the whole time of other scenes than films passes
+_DARK, _EDGE = 0.05, (1.0, 0.72, 0.42)  # what is around a film's frame, and around what was not filmed
 _GAP = 4  # white pixels between two images
 
 Point = tuple[float, float, float]
@@ -48,6 +51,9 @@ class ViewState:
         trajectories: draw trajectories of points all over the moving surface.
         followed: points, each with the time at which it is there, whose trajectories are drawn.
         training_view: the training view that is compared with its image; None: none.
+        lean: degrees to the right and upwards from where a film's camera was at the time; the image then has
+            the film's frame, and ``pose`` and ``fov`` follow. None: the page flies freely.
+        zoom: by which a film's frame is narrowed, at least 1.
     """
 
     pose: Tensor
@@ -58,6 +64,8 @@ class ViewState:
     trajectories: bool = False
     followed: tuple[tuple[Point, float], ...] = ()
     training_view: int | None = None
+    lean: tuple[float, float] | None = None
+    zoom: float = 1.0
 
     @property
     def drawn_by_browser(self) -> bool:
@@ -271,11 +279,21 @@ class Viewer:
         scene: of all renderers.
         renderers: none while a run in training has not begun, else one or two, side by side.
         rows: of an image at rest; None: as the training images have, at least 400.
+        trust: degrees beside a film's path to which its images were found to be good; None: not measured.
+
+    Attributes:
+        film: the path of the one camera that filmed the scene; None: there was none.
+        seconds: in which the whole time passes: those of the film, or 4.
     """
 
     def __init__(
-        self, scene: Scene, renderers: Sequence[SceneRenderer] = (), rows: int | None = None
+        self,
+        scene: Scene,
+        renderers: Sequence[SceneRenderer] = (),
+        rows: int | None = None,
+        trust: float | None = None,
     ) -> None:
+        self.film, self.seconds = FilmPath.of_scene(scene, trust), scene.protocol.get("seconds", _SECONDS)
         self.scene, self.renderers = scene, list(renderers)
         cameras = [frame.camera for frame in scene.train]
         self.rows = rows or max(_MIN_FULL_ROWS, *(camera.height for camera in cameras))
@@ -331,15 +349,34 @@ class Viewer:
             rows = [in_a_row(r.comparison(state.training_view, *cell), _GAP) for r in self.renderers]
             gap = rows[0].new_ones(_GAP, rows[0].shape[1], 3)
             stacked = torch.cat([part for row in rows for part in (gap, row)][1:])
-            return on_white(stacked, width, height)
-        camera = self._camera(state, width, height)
+            return padded(stacked, width, height)
+        part, camera = self._part_width(width), self._camera(state, width, height)
         images = [renderer.image(state, camera, chunks, self.queue.is_stale) for renderer in self.renderers]
-        return images[0] if count == 1 else on_white(in_a_row(images, _GAP), width, height)
+        if state.lean is not None:
+            images = [padded(image, part, height, _DARK) for image in images]
+        elif self.beyond(state) > 0:
+            images = [edged(image) for image in images]
+        return images[0] if count == 1 else padded(in_a_row(images, _GAP), width, height)
+
+    def beyond(self, state: ViewState) -> float:
+        """Return by how many degrees a page that flies freely is beside what a film shows; 0: within."""
+        if self.film is None or state.lean is not None or state.training_view is not None:
+            return 0.0
+        beside = self.film.beside(camera_of(state, 1, 1, self.scene), state.time)
+        return beside if beside > self.film.degrees else 0.0
+
+    def _part_width(self, width: int) -> int:
+        count = len(self.renderers)
+        return max(1, (width - (count - 1) * _GAP) // count)
 
     def _camera(self, state: ViewState, width: int, height: int) -> Camera:
         """Make the camera of one renderer's part of an image; beside another it sees what a square would."""
-        count = len(self.renderers)
-        part = max(1, (width - (count - 1) * _GAP) // count)
+        count, part = len(self.renderers), self._part_width(width)
+        if state.lean is not None:  # all of the film's frame
+            camera = self.film.leant(state.time, *state.lean)
+            scale = min(part / camera.width, height / camera.height)
+            camera = camera.resized(*(max(1, int(scale * side)) for side in (camera.width, camera.height)))
+            return replace(camera, fx=state.zoom * camera.fx, fy=state.zoom * camera.fy)
         camera = camera_of(state, part, height, self.scene)
         if count == 1 or part >= height:
             return camera
@@ -349,14 +386,24 @@ class Viewer:
         """Return the world point seen at ``x y``, fractions of the whole image; None: nothing solid."""
         camera = self._camera(state, width, height)
         number = min(int(x * len(self.renderers)), len(self.renderers) - 1)
-        column = int(x * width) - number * (camera.width + _GAP)
-        pixel, moment = (column, int(y * height)), Moment(state.time)
+        part = self._part_width(width)
+        column = int(x * width) - number * (part + _GAP) - (part - camera.width) // 2
+        pixel, moment = (column, int(y * height) - (height - camera.height) // 2), Moment(state.time)
         return self.renderers[number].point_at(camera, pixel, moment, state.layer)
 
 
-def on_white(image: Tensor, width: int, height: int) -> Tensor:
-    """Put an image (h, w, 3) into the middle of a white one (height, width, 3)."""
-    white = image.new_ones(height, width, 3)
+def padded(image: Tensor, width: int, height: int, shade: float = 1.0) -> Tensor:
+    """Put an image (h, w, 3) into the middle of a plain one (height, width, 3)."""
+    plain = image.new_full((height, width, 3), shade)
     top, left = (height - image.shape[0]) // 2, (width - image.shape[1]) // 2
-    white[top : top + image.shape[0], left : left + image.shape[1]] = image
-    return white
+    plain[top : top + image.shape[0], left : left + image.shape[1]] = image
+    return plain
+
+
+def edged(image: Tensor) -> Tensor:
+    """Draw the edge of an image (H, W, 3) that shows what was not filmed."""
+    edge, color = max(2, image.shape[0] // 150), image.new_tensor(_EDGE)
+    image = image.clone()
+    for side in (image[:edge], image[-edge:], image[:, :edge], image[:, -edge:]):
+        side[:] = color
+    return image

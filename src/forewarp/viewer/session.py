@@ -26,7 +26,8 @@ if TYPE_CHECKING:
 
 MIN_INTERVAL = 1 / 30  # seconds between two images while time plays
 REST_SECONDS = 0.15  # without a change, after which the camera is at rest
-PLAYBACK_SECONDS = 4.0  # in which the whole time passes at speed 1
+LEAN_SECONDS = 0.8  # for which a lean stays that nobody changes any more
+_SPRING = 0.55  # of a lean is left from image to image
 VIDEO_FPS = 25.0
 WIDEST = 4  # columns of an image for each row of the largest
 MIN_VIDEO_SECONDS, MAX_VIDEO_SECONDS = 0.1, 600.0
@@ -47,7 +48,9 @@ class Session:
 
     def __init__(self, viewer: Viewer, page: Page, clock: Callable[[], float] = time.perf_counter) -> None:
         self.viewer, self.page, self._clock = viewer, page, clock
-        self.state = ViewState.first(viewer.scene)
+        self.state, self._leant = ViewState.first(viewer.scene), 0.0
+        if viewer.film is not None:
+            self.state = replace(self.state, lean=(0.0, 0.0), time=0.0)
         self.playing, self.loop, self._speed, self._advanced = False, True, 1.0, 0.0
         self.rendered, self._rate = 0, 0.0  # images so far; images a second
         self._control, self._frame_rate = FrameRateControl(), FrameRate()
@@ -65,6 +68,23 @@ class Session:
             if "time" in changes:
                 self._advanced = self._clock()
         self.refresh()
+
+    def lean(self, across: float, upward: float, zoom: float) -> None:
+        """Lean from the film's path by degrees, which spring back after a moment, and narrow its frame."""
+        self._leant = self._clock()
+        self.change(lean=(across, upward), zoom=zoom, training_view=None)
+
+    def _spring_back(self) -> bool:
+        """Let go of a part of a lean that nobody holds; return whether there is one, held or not."""
+        with self._lock:
+            lean = self.state.lean
+            if lean is None or not any(lean):
+                return False
+            if self._clock() - self._leant >= LEAN_SECONDS:
+                self.page.let_go()
+                rest = tuple(_SPRING * part for part in lean)
+                self.state = replace(self.state, lean=rest if max(map(abs, rest)) > 0.05 else (0.0, 0.0))
+            return True
 
     def show_training_view(self, index: int | None) -> int | None:
         """Stand where a training image was taken, at its time, and compare; None: leave.
@@ -92,7 +112,7 @@ class Session:
         self.refresh()
 
     def set_speed(self, speed: float) -> None:
-        """Change how fast time passes; at speed 1 the whole time takes 4 seconds."""
+        """Change how fast time passes; at speed 1 the whole time takes the ``viewer.seconds``."""
         with self._lock:
             self._advance()
             self._speed = speed
@@ -140,7 +160,7 @@ class Session:
             if not self.playing:
                 return
             now = self._clock()
-            time = self.state.time + self._speed * (now - self._advanced) / PLAYBACK_SECONDS
+            time = self.state.time + self._speed * (now - self._advanced) / self.viewer.seconds
             self._advanced, self.playing = now, self.loop or time < 1
             self.state = replace(self.state, time=time % 1.0 if self.loop else min(time, 1.0))
         self.page.show_time(self.state.time)
@@ -156,8 +176,13 @@ class Session:
             self.page.tell(viewer.note)
             return
         self._advance()
+        leaning = self._spring_back()
         with self._lock:
-            state = self.state = viewer.supported(self.state)
+            state = viewer.supported(self.state)
+            if state.lean is not None:
+                camera = viewer.film.leant(state.time, *state.lean)
+                state = replace(state, pose=camera.camera_to_world, fov=vertical_fov(camera))
+            self.state = state
         moving = self.playing or not at_rest  # it may play since this was submitted
         width, full_rows = self.full_size()
         rows = full_rows
@@ -188,11 +213,18 @@ class Session:
             if state.training_view is not None:
                 name = viewer.scene.train[state.training_view].name
                 about += f" | training image {name}: truth, prediction, error"
+            if beyond := viewer.beyond(state):
+                trusted = f"the film shows up to {viewer.film.degrees:.0f}"
+                about += f" | {beyond:.0f} degrees beside the film's camera: {trusted}"
         self.rendered += 1
         if moving:  # the rate of a single image is what it took
             self._rate = self._frame_rate.record(self._clock()) or 1 / max(seconds, 1e-3)
         note = f"{viewer.note} | " if viewer.note else ""
         self.page.tell(f"{note}{self._rate:.1f} images/s | {1000 * seconds:.0f} ms | {about}")
+        if leaning and not self.playing and not queue.is_stale():
+            wait = max(0.0, self._leant + LEAN_SECONDS - self._clock())
+            queue.submit(self, "image", self._render, priority=1, delay=wait)
+            return
         if not moving or queue.is_stale():
             return
         if self.playing:
@@ -298,7 +330,7 @@ def camera_path(keys: Sequence[ViewState], number: int) -> list[ViewState]:
     angles = PchipInterpolator(knots, [key.fov for key in keys])(positions)
     before = [keys[min(int(position + 1e-9), len(keys) - 1)] for position in positions]
     return [
-        replace(key, pose=torch.from_numpy(pose), time=time, fov=fov, training_view=None)
+        replace(key, pose=torch.from_numpy(pose), time=time, fov=fov, training_view=None, lean=None)
         for key, pose, time, fov in zip(before, poses, times.tolist(), angles.tolist())
     ]
 
