@@ -59,7 +59,9 @@ def test_parts_share_one_line_with_the_time_left_of_all(monkeypatch):
             for clock[0], done in ((30.0, 5), (90.0, 6)):
                 counted(done, 10)
         with whole.part("training"):
-            ProgressLine("fine").show(0.5, 200.0, "psnr 23")
+            line = ProgressLine("fine", stream=io.StringIO())
+            line.show(0.5, 200.0, "psnr 23")
+            assert line.terminal  # of the whole
     texts = [text for _, text in shown]
     assert texts[0] == "3:00 left | 1/2 cameras"
     assert "2:30 left | 1/2 cameras | features 50% | 5/10" in texts

@@ -131,7 +131,8 @@ class ProgressLine:
         self, title: str, *, refresh: float = 0.25, every: float = 10.0, stream: TextIO | None = None
     ) -> None:
         self.title, self.stream = title, stream or sys.stderr
-        self.terminal = self.stream.isatty()
+        # rich puts streams that are no terminals in place of ours while a line is shown.
+        self.terminal = self.stream.isatty() if self.whole is None else self.whole.line.terminal
         self.interval = refresh if self.terminal else every
         self._next = time.perf_counter() + (0.0 if self.terminal else every)
         self._bar: Progress | None = None
