@@ -1,10 +1,12 @@
 import math
+from types import SimpleNamespace
 
 import pytest
 import torch
 
 from forewarp.drawing.images import error_colors
 from forewarp.evaluation.images import (
+    Filled,
     image_flow,
     images_of,
     make_shots,
@@ -218,3 +220,13 @@ def test_paths_of_a_film_are_refused_without_one(cameras):
     assert FilmPath.of(cameras, [i / 11 for i in (0, 5, 2, 9, 1, 11, 3, 7, 4, 8, 6, 10)]) is None
     with pytest.raises(ValueError, match="path: expected fixed, .* no one camera filmed .* got 'lean'"):
         make_shots("lean", 5, 0.5, cameras[0], cameras)
+
+
+def test_holes_get_the_colours_around_them_and_all_else_stays():
+    image, opacity = torch.zeros(20, 30, 3), torch.ones(20, 30)
+    image[:, :15, 0], image[:, 15:, 2] = 1.0, 0.5
+    opacity[6:12, 3:9] = opacity[6:12, 20:26] = 0
+    holed = torch.where(opacity[..., None] > 0, image, WHITE)
+    filled = Filled(WHITE)(holed, SimpleNamespace(opacity=opacity.flatten()), None, 0.0)
+    assert torch.allclose(filled[opacity > 0], image[opacity > 0], atol=1e-6)
+    assert float((filled - image).abs().max()) < 0.2

@@ -21,7 +21,8 @@ What one types most:
   frames=N fps=N size=N         how many, how fast, pixels of the longer side (as the images, at least 400)
   view=N                        the test view that it shows or starts from
   format=mp4|gif|png            a video, an animated picture, one picture a frame
-  layer=moving|resting          only the particles that move, or those that rest
+  layer=moving|resting          only the particles that move, or those that rest, whose holes in a film get
+                                the colours around them
   masks=true                    also a mask of what moves for each picture, in videos/<name>_masks/
   points=N tail=SHARE           how many trajectories, and for what share of the time they stay visible
   trust=[PACKAGE]               code of other packages that the run's config may name
@@ -81,7 +82,7 @@ def pictures_of(config, module, datamodule, film, masks: Path, progress):
     """
     from forewarp.drawing.images import keep_first, write_png
     from forewarp.evaluation.filmed import Fade
-    from forewarp.evaluation.images import FILMED, make_shots, moving_share, sized, video
+    from forewarp.evaluation.images import FILMED, Filled, make_shots, moving_share, sized, video
     from forewarp.evaluation.layers import layer_of, moving_rows
     from forewarp.evaluation.trajectories import Trajectories
 
@@ -92,11 +93,13 @@ def pictures_of(config, module, datamodule, film, masks: Path, progress):
     moving = moving_rows(method, frames, "masks") if str(config.masks).lower() == "true" else None
     module.method = layer_of(method, config.layer, frames)
     fade = None if datamodule.scene.has_alpha else Fade(cameras)
-    paints = [] if fade is None else [fade]
+    behind = targets[config.view].background.to(module.device)
+    holes = [Filled(behind)] if config.layer == "resting" and fade is not None else []
+    paints = [*holes, *filter(None, [fade])]
     if config.path == "trajectories":
         paints.append(Trajectories(module, cameras, count=config.points, tail=float(config.tail)))
     target = targets[config.view]
-    camera, background = target.frame.camera, target.background.to(module.device)
+    camera = target.frame.camera
     start = sized(camera, config.size or max(camera.width, camera.height, LEAST_SIZE))
     seconds = datamodule.scene.protocol.get("seconds")
     lasts = round(seconds * config.fps) if seconds and config.path in FILMED else _FRAMES
@@ -106,7 +109,7 @@ def pictures_of(config, module, datamodule, film, masks: Path, progress):
     def pictures():
         if moving is not None:
             keep_first(masks, len(shots))
-        for number, picture in enumerate(video(module, shots, background, paints)):
+        for number, picture in enumerate(video(module, shots, behind, paints)):
             if moving is not None:
                 share = moving_share(method, moving, *shots[number])
                 write_png(masks / f"{number:04d}.png", (share > HALF).float())

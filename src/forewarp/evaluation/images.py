@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import lightning
 import torch
 from torch import Tensor
+from torch.nn.functional import avg_pool2d, interpolate
 
 from forewarp.drawing.images import (
     area_means,
@@ -192,6 +194,27 @@ def shots_of_views(frames: Sequence[Frame], count: int, size: int) -> list[Shot]
             return [(within(frame.camera, size), frame.time) for frame in chosen]
     camera = within(frames[0].camera, size)
     return make_shots("fixed", count, 0.0, camera, [camera])
+
+
+@dataclass(frozen=True)
+class Filled:
+    """Give holes of an image, before a ``background`` (3,), the colours around them, the nearest first; see
+    ``video``.
+    """
+
+    background: Tensor
+
+    def __call__(self, image: Tensor, drawn: Rendering, camera: Camera, time: float) -> Tensor:
+        """Return an image (H, W, 3) without holes."""
+        behind, shape = self.background.to(image)[:, None, None], image.shape[:2]
+        opacity = drawn.opacity.reshape(1, *shape).clamp(0, 1).to(image)
+        seen = torch.cat([image.permute(2, 0, 1) - (1 - opacity) * behind, opacity])[None]
+        smaller = seen
+        while max(smaller.shape[2:]) > 1:
+            smaller = avg_pool2d(smaller, 2, ceil_mode=True)
+            around = interpolate(smaller, shape, mode="bilinear", align_corners=False)
+            seen = seen + (1 - seen[:, 3:]) * around
+        return (seen[0, :3] + (1 - seen[0, 3:]) * behind).permute(1, 2, 0).clamp(0, 1)
 
 
 def video(
