@@ -4,7 +4,8 @@ A box that slides and turns and a ball that bounces, before a textured room, hel
 with an exposure that drifts and a shutter that is open for half of the time. Writes ``OUT/film.mp4``, which
 players turn by its rotation flag, and ``OUT/truth``, a scene with true poses, times and masks of what moves;
 its validation views lie beside the path. ``--score RUN`` scores a run of the film, captured or of ``truth``,
-by the true masks: views that it holds out, and those beside the path.
+by the true masks: views that it holds out, and those beside the path. ``--lean RUN`` compares leaned views
+with the truth and with what the run's own photos tell of them (``evaluation/trust.py``).
 """
 
 from __future__ import annotations
@@ -21,10 +22,12 @@ from omegaconf import OmegaConf
 from torch import Tensor
 
 from forewarp.capture.frames import shrunk
+from forewarp.capture.motion import resized_mask
 from forewarp.data.batches import Targets
 from forewarp.data.images import MovingMask, read_image
 from forewarp.data.posed_video import PosedShot, read_scene, write_scene
 from forewarp.data.transforms import hold_out_every
+from forewarp.evaluation import trust
 from forewarp.evaluation.evaluate import draw
 from forewarp.metrics.image import psnr
 from forewarp.metrics.registry import PARTS, scores_of_parts
@@ -223,6 +226,13 @@ def _small(path: Path, size: tuple[int, int]) -> Tensor:
     return torch.from_numpy(shrunk(read_image(path).numpy(), *size[::-1]))
 
 
+def _sized(pixels: np.ndarray, moving: np.ndarray, camera: Camera) -> tuple[Tensor, Tensor]:
+    """Return a frame in [0, 1] and its mask in a camera's size."""
+    shape, size = (camera.height, camera.width), (camera.width, camera.height)
+    image = torch.from_numpy(pixels if pixels.shape[:2] == shape else shrunk(pixels, *shape))
+    return image.float() / 255, torch.from_numpy(resized_mask(moving, size))
+
+
 def scores(module, frames: Sequence[Frame], background: Tensor) -> dict[str, float]:
     """Return mean PSNR of frames, and of their parts where these have pixels."""
     rows: dict[str, list[float]] = {name: [] for name in ("all", *PARTS)}
@@ -247,14 +257,53 @@ def score(folder: Path, run: Path) -> dict[str, dict[str, float]]:
     return table
 
 
+@torch.no_grad()
+def lean(folder: Path, run: Path) -> dict[tuple[str, float], np.ndarray]:
+    """Print of leaned views, by part and angle, the PSNR against the truth, that against the carried photo,
+    and the share of pixels that stand before the photo: means, which are returned.
+    """
+    made, module = opened(saved_config(str(run), OmegaConf.create({"trust": []})))
+    scene, targets = made.datamodule.scene, made.datamodule.targets("test")
+    known = read_scene(folder, TRUTH, normalise=False)
+    true = {number_of(frame.name): frame.camera for frame in (*known.train, *known.test)}
+    own = {number_of(frame.name): frame.camera for frame in (*scene.train, *scene.test)}
+    numbers = sorted(own.keys() & true.keys())
+    similarity, *_ = pose_errors([own[n] for n in numbers], [true[n] for n in numbers])
+    seconds, size = known.protocol["seconds"], (known.train[0].camera.width, known.train[0].camera.height)
+    filming = Filming(Form(len(true), (len(true) - 1) / seconds, size))
+    found: dict[tuple[str, float], list[tuple[float, ...]]] = {}
+    for target, plain, camera, angle in trust.leaned_views(module.method, targets, range(len(targets))):
+        aside = torch.linalg.inv(target.frame.camera.camera_to_world) @ camera.camera_to_world
+        aside[:3, 3] *= similarity.scale
+        pixels, moving = filming.take(target.frame.time, aside)
+        pixels, moving = _sized(pixels, moving, camera)
+        drawn = trust.image_at(module.method, target.frame, target.frame.time, target.background, camera)
+        told = trust.compared(module.method, target, plain, camera)
+        for part, mask in zip(trust.PARTS, (moving, ~moving)):
+            if part in told and bool(mask.any()):
+                score = psnr(drawn.rgb[mask][None], pixels[mask][None])
+                found.setdefault((part, angle), []).append((score, *told[part]))
+    means = {key: np.mean(rows, axis=0) for key, rows in sorted(found.items())}
+    print("part     degrees   truth   photo   front")
+    for (part, angle), (truth, photo, front) in means.items():
+        print(f"{part:<8} {angle:>7g} {truth:>7.2f} {photo:>7.2f} {front:>7.3f}")
+    return means
+
+
 def main() -> None:
     """Film, or score a run."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("out", type=Path)
     parser.add_argument("--score", type=Path, metavar="RUN")
+    parser.add_argument("--lean", type=Path, metavar="RUN")
     words = parser.parse_args()
     torch.set_num_threads(1)
-    film(words.out) if words.score is None else score(words.out, words.score)
+    if words.lean is not None:
+        lean(words.out, words.lean)
+    elif words.score is not None:
+        score(words.out, words.score)
+    else:
+        film(words.out)
 
 
 if __name__ == "__main__":

@@ -8,7 +8,7 @@ the photo would show it. What the photo does not see is left out: it may be hidd
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from statistics import fmean
 
 import torch
@@ -24,14 +24,14 @@ from forewarp.scene.view import Rendering, Target
 
 ANGLES = (3.0, 5.0, 7.0, 10.0, 15.0)  # degrees
 _IMAGES = 4  # held out, from which one leans
-# Of an angle that is good: the largest share of pixels that stand before what the photo shows, and by how
-# many decibels less it may be like the photo than at the first angle.
+# Of an angle that is good, against the first: by how large a share of pixels more may stand before what the
+# photo shows, as uncertain depth does at any angle; and by how many decibels less it may be like the photo.
 _FRONT, _FALL = 0.1, 3.0
 _CLEAR = 30.0  # dB, from which on two images are the same: photos are interpolated
 _MOST_DROP = 5.0  # dB from the own to the crossed score, from which on no angle is good
 _SAME = 0.03  # share of a distance within which two are the same
 _FEW = 100  # pixels that are too few to say anything
-_PARTS = "subject", "rest"
+PARTS = "subject", "rest"
 
 
 @torch.no_grad()
@@ -55,21 +55,30 @@ def trust_of(
     """
     if scene.has_alpha or not isinstance(method, HasMovingGaussians):
         return {}
-    found: dict[str, list[list[tuple[float, float]]]] = {part: [[] for _ in ANGLES] for part in _PARTS}
-    for turn, i in enumerate(spread(len(numbers), _IMAGES)):
-        target = targets[numbers[i]]
-        plain = image_at(method, target.frame, target.frame.time, target.background.to(method.device))
-        pivot = pivot_of(target, plain)
-        for place, angle in enumerate(ANGLES):
-            for degrees in (-angle, angle):
-                across, upward = (0.0, degrees) if turn % 2 else (degrees, 0.0)
-                camera = leaned(target.frame.camera, pivot, across, upward)
-                for part, seen in compared(method, target, plain, camera).items():
-                    found[part][place].append(seen)
+    found: dict[str, list[list[tuple[float, float]]]] = {part: [[] for _ in ANGLES] for part in PARTS}
+    for target, plain, camera, angle in leaned_views(method, targets, numbers):
+        for part, seen in compared(method, target, plain, camera).items():
+            found[part][ANGLES.index(angle)].append(seen)
     angles = {part: angle_of(seen) for part, seen in found.items() if all(seen)}
     if drop is not None and drop > _MOST_DROP:
         angles = dict.fromkeys(angles, 0.0)
     return {"degrees": min(angles.values()), **angles} if angles else {}
+
+
+def leaned_views(
+    method: Method, targets: Sequence[Target], numbers: Sequence[int]
+) -> Iterator[tuple[Target, Rendering, Camera, float]]:
+    """Give some of the images, what the method shows from where they were taken, and cameras that lean from
+    there by each of ``ANGLES``: to both sides, of every second image up and down.
+    """
+    for turn, i in enumerate(spread(len(numbers), _IMAGES)):
+        target = targets[numbers[i]]
+        plain = image_at(method, target.frame, target.frame.time, target.background.to(method.device))
+        pivot = pivot_of(target, plain)
+        for angle in ANGLES:
+            for degrees in (-angle, angle):
+                across, upward = (0.0, degrees) if turn % 2 else (degrees, 0.0)
+                yield target, plain, leaned(target.frame.camera, pivot, across, upward), angle
 
 
 def pivot_of(target: Target, drawn: Rendering) -> Tensor:
@@ -114,7 +123,7 @@ def compared(
     if target.valid is not None:
         inside &= carried(target.valid[None], "nearest")[0] > 0.5
     error, found = (drawn.rgb - photo).square().mean(-1), {}
-    for part, chosen in zip(_PARTS, (inside & subject, inside & ~subject)):
+    for part, chosen in zip(PARTS, (inside & subject, inside & ~subject)):
         shown = chosen & ~behind
         if int(shown.sum()) >= _FEW:
             decibels = -10 * math.log10(max(float(error[shown].mean()), 1e-10))
@@ -126,15 +135,15 @@ def angle_of(seen: Sequence[Sequence[tuple[float, float]]]) -> float:
     """Return the angle, degrees, up to which images are good, from what was seen at each of ``ANGLES``.
 
     >>> angle_of([[(25.0, 0.02)], [(24.0, 0.05)], [(23.0, 0.15)], [(20.0, 0.3)], [(18.0, 0.4)]])
-    6.0
+    6.4
     """
     first = fmean(min(decibels, _CLEAR) for decibels, _ in seen[0])
+    uncertain = fmean(front for _, front in seen[0])
     before, worse_before = 0.0, 0.0
     for angle, images in zip(ANGLES, seen):
         fall = first - fmean(min(decibels, _CLEAR) for decibels, _ in images)
-        worse = max(
-            fmean(front for _, front in images) / _FRONT, fall / _FALL
-        )  # 1 where it is no longer good
+        more = fmean(front for _, front in images) - uncertain
+        worse = max(more / _FRONT, fall / _FALL)  # 1 where it is no longer good
         if worse > 1:
             return round(before + (angle - before) * (1 - worse_before) / (worse - worse_before), 1)
         before, worse_before = angle, worse
