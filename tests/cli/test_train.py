@@ -88,7 +88,7 @@ def test_a_run_leaves_what_it_promises_and_says_so(fitted):
 def test_metrics_have_the_promised_shape(fitted):
     content = read(fitted / "metrics.json")
     whole = {"protocol", "seconds", "clocks", "steps", "peak_memory_bytes", "parameters", "size", "effects"}
-    assert set(content) == whole | {"test", "metrics", "flow", "flow_variation", "canonical_shape"}
+    assert set(content) == whole | {"test", "metrics", "flow", "flow_variation", "canonical_shape", "absent"}
     assert content["metrics"]["depth_delta_1.02"]["higher_is_better"]
     assert content["metrics"].keys() == {name for scores in content["test"].values() for name in scores}
     seconds = content["seconds"]

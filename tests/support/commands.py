@@ -18,7 +18,7 @@ from hydra.core.hydra_config import HydraConfig
 SCENE = {"size": 32, "frames": 6, "test_views": (2, 1, 2), "val_views": 1, "samples_per_pixel": 1}
 TINY = ["model=forward", "data=dnerf", "data.scene=vehicle", "preset=demo", "trainer=cpu", "data.rays=128"]
 TINY += ["budget.iterations=60", "stage.fine.num_voxels=[[0,8000]]", "stage.coarse.num_voxels=[[0,4000]]"]
-TINY += ["threads=1"]
+TINY += ["threads=1", "data.depth_kind=ray"]
 
 
 def call(name, *arguments):
