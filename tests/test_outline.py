@@ -36,6 +36,7 @@ BIG = int("9" * 300)
         ),
         ({"objective": "x"}, "objective: expected keys of its own or null, but got 'x'"),
         ({"paths": {"runs": {}}}, "paths.runs: expected a text, but got {}"),
+        ({"paths": ["x"]}, r"paths: expected keys of its own or null, but got \['x'\]"),
     ],
 )
 def test_a_part_of_another_kind_is_named(tmp_path, change, says):

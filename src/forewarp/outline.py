@@ -7,7 +7,7 @@ from reprlib import repr as short
 
 # Parts that have keys of their own, those that may be null instead, and those whose parts are of either kind.
 _SECTIONS = ("model", "data", "budget", "preset", "trainer", "callbacks", "stage")
-_OPTIONAL = ("objective", "logger", "target", "trackers", "sentinel", "variant")
+_OPTIONAL = ("objective", "logger", "target", "trackers", "sentinel", "variant", "paths")
 _OF_SECTIONS = ("callbacks", "stage")
 _OF_STAGES = ("curriculum", "objective", "model")
 _TEXTS = ("run", "model.name", "preset.name")
