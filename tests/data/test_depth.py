@@ -181,7 +181,13 @@ def test_depth_of_a_video_is_in_the_units_of_its_poses(tmp_path):
     scaled = read_scene(tmp_path, "toy", depth=str(tmp_path / "lidar"))
     torch.testing.assert_close(scaled.train[0].load_sensed(), larger.load_sensed())
     assert not [line for line in scaled.protocol["assumed"] if "depth_unit" in line]
-    edit(folder / FILE, {"depth_unit_scale_factor": None})
+    edit(folder / FILE, {"depth_scale": 1e-3})
+    with refused("depth_scale: expected the unit that depth_unit_scale_factor says, 0.002, but got 0.001"):
+        read_scene(tmp_path, "toy", depth=str(tmp_path / "lidar"))
+    edit(folder / FILE, {"depth_unit_scale_factor": None, "depth_scale": 2e-3})  # as RealSense writes it
+    scaled = read_scene(tmp_path, "toy", depth=str(tmp_path / "lidar"))
+    torch.testing.assert_close(scaled.train[0].load_sensed(), larger.load_sensed())
+    edit(folder / FILE, {"depth_scale": None})
     edit(folder / FILE, {"frames.0.depth_file_path": "../lidar/frame_1.png"})
     with refused("depth_file_path"):
         read_scene(tmp_path, "toy")

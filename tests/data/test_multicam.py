@@ -181,6 +181,15 @@ def set_to(row, column, value):
     return rows(change)
 
 
+def suffixed(folder, left_out):
+    """Let names of images not end in their number; the cameras named lack one image, and have one more."""
+    for place in folder.glob("cam*"):
+        images = sorted(place.iterdir())
+        for number, image in enumerate(images):
+            later = number + (number >= left_out.get(place.name, len(images)))
+            image.rename(place / f"{later:04d}_v2.png")
+
+
 def called(names):
     """Give the cameras other names; those of films are of empty ones."""
 
@@ -219,6 +228,10 @@ BAD = [
     (
         lambda folder: (folder / "cam01" / "0003.png").rename(folder / "cam01" / "0013.png"),
         "cam01: expected a frame of the number of cam00/0003.png, but got 0004.png; remove a frame that",
+    ),
+    (
+        lambda folder: suffixed(folder, {"cam01": 3}),
+        "cam01: expected a frame of the number of cam00/0003_v2.png, but got 0004_v2.png; remove a",
     ),
 ]
 

@@ -694,6 +694,12 @@ def test_what_looks_like_masks_depth_or_a_lens_and_is_not_read_is_named(tmp_path
     assert "depths/ is not read" in said
     assert "masks_2/ is not read" in said
     assert re.search("json: integer_depth_scale, rolling_shutter, mask_filename, depth_path: not read", said)
+    unread = {"principal_point": [9, 9], "ppx": 9.0, "c_x": 9.0, "shift_x": 0.1, "K1": 0.2, "k_1": 0.2}
+    for key, value in (unread | {"radial": [0.2, 0], "lens": {"k1": 0.2}}).items():
+        edit(folder / FILE, {"integer_depth_scale": None, "rolling_shutter": None, key: value})
+        said = "\n".join(read_scene(tmp_path, "toy").protocol["assumed"])
+        assert re.search(rf"json: [^:]*\b{key}\b[^:]*: not read, which seem", said)
+        edit(folder / FILE, {key: None})
     edit(folder / FILE, {"frames.0.mask_path": "masks/a.png"})
     assert "masks_2/" not in "\n".join(read_scene(tmp_path, "toy", masks="off").protocol["assumed"])
 

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from forewarp.data import video
+from forewarp.data.files import SceneError
 from forewarp.data.video import extracted, header_of, stamps_of
 from tests.support.films import numbered, write_film
 
@@ -30,6 +31,13 @@ def test_the_frames_that_are_chosen_are_given(tmp_path, monkeypatch, chosen, mos
     write_film(tmp_path / "a.mp4", numbered(12, step=20))
     greys = [int(frame[-1, -1, 0]) for frame in extracted(tmp_path / "a.mp4", chosen, None)]
     assert greys == pytest.approx([20 * n for n in chosen], abs=4)
+
+
+def test_a_video_that_does_not_store_the_time_of_each_frame_is_refused(tmp_path):
+    coded = ["-c:v", "mpeg4", "-bf", "2", "-vtag", "XVID"]
+    film = write_film(tmp_path / "a.avi", numbered(12), options=coded)
+    with pytest.raises(SceneError, match="avi: expected a time stamp of each frame, but got .* without"):
+        stamps_of(film)
 
 
 def test_what_is_no_video_has_no_frames(tmp_path):

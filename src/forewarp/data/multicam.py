@@ -383,14 +383,23 @@ def _moments(tracks: Sequence[_Track], most: int | None, folder: Path) -> tuple[
             got = f"{rates[1]:.4g} a second, {abs(mine[at] - first[at]):.3g} s apart at frame {at}"
             raise mismatch(film.path, expected, got, "convert all to one constant rate, or remove the camera")
     folders = [track for track in tracks if track.images]
-    for track in folders[1:]:
-        for mine, first in zip(track.images[:count], folders[0].images):
-            here, there = (re.search(r"\d*$", path.stem)[0].lstrip("0") for path in (mine, first))
-            if here != there:
-                expected = f"a frame of the number of {folders[0].path.name}/{first.name}"
+    numbers = [_numbers([path.stem for path in track.images[:count]]) for track in folders]
+    for track, mine in zip(folders[1:], numbers[1:]):
+        for at in range(count):
+            if mine[at] != numbers[0][at]:
+                expected = f"a frame of the number of {folders[0].path.name}/{folders[0].images[at].name}"
                 advice = "remove a frame that one camera lacks from all"
-                raise mismatch(track.path, expected, mine.name, advice)
+                raise mismatch(track.path, expected, track.images[at].name, advice)
     return count, assumed
+
+
+def _numbers(names: Sequence[str]) -> list[list[int]]:
+    """Return the numbers in each name, without those that all names share."""
+    found = [[int(digits) for digits in re.findall(r"\d+", name)] for name in names]
+    if len({*map(len, found)}) != 1:
+        return [each[-1:] for each in found]
+    varied = [column for column in zip(*found) if len({*column}) > 1]
+    return [[column[at] for column in varied] for at in range(len(found))]
 
 
 def _times(tracks: Sequence[_Track], count: int, folder: Path) -> tuple[list[float], list[str]]:

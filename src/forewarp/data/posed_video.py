@@ -188,9 +188,14 @@ def read_scene(
     entries, absent, assumed = _read_entries(file, content, scale, axes, inverse, masks)
     assumed += ordered
     beside = [] if depth in (None, "off") else [file.parent / depth]
-    unit, content = content.get(_UNIT), {key: value for key, value in content.items() if key != _UNIT}
-    if depth_scale is None:
-        depth_scale = number_or_none(unit, f"{file}: {_UNIT}", 1 / MOST_UNITS)
+    units = {key: content[key] for key in (_UNIT, "depth_scale") if content.get(key) is not None}
+    content = {key: value for key, value in content.items() if key != _UNIT}
+    if depth_scale is None and units:
+        key, unit = units.popitem()
+        if units and units[_UNIT] != unit:
+            advice = f"remove {key} or {_UNIT}"
+            raise mismatch(f"{file}: {key}", f"the unit that {_UNIT} says, {units[_UNIT]}", unit, advice)
+        depth_scale = number_or_none(unit, f"{file}: {key}", 1 / MOST_UNITS)
     assumed += unread_beside(file, content, [entry.path for entry in entries], beside)
     cut_out = [entry.load for entry in entries if entry.is_cut_out]
     premultiplied, told = alpha_of(alpha, [load.path for load in cut_out], file)

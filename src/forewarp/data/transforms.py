@@ -47,9 +47,13 @@ _NO_PINHOLE = re.compile(
     "(?i)fish|equi(dist|rect|sol)|pano|spheric|omnidir|ortho|lat_?long|cylind|kannala|thin_?prism|ftheta"
 )
 _UNREAD_LENSES = ("distortion_params", "distortion", "dist_coeffs", "distortion_coefficients", "dist")
-_LIKE_LENS = re.compile(r"(?i)(k[4-9]|.*distort.*|dist_?coe.*|rolling_shutter.*|ocam.*|xi)")
+_LIKE_LENS = re.compile(
+    r"(?i)(k_?[1-9]|kappa_?\d|p_?[12]|radial.*|tangential.*|brown.*|.*distort.*|dist_?coe.*|rolling_shutter.*"
+    r"|ocam.*|xi|c_?[xy]|pp_?[xy]|principal_?point.*|shift_?[xy])"
+)
+_LENS = ("k1", "k2", "k3", "p1", "p2", "cx", "cy")
 _PATHS = ("file_path", "mask_path", "depth_file_path", "moving_path", "resting_path")
-_READ = {*_PATHS, "depth_scale", *_UNREAD_LENSES}  # or told elsewhere
+_READ = {*_PATHS, "depth_scale", *_LENS, *_UNREAD_LENSES}  # or told elsewhere
 # Matrices of intrinsics, as programs call them.
 _INNER = ("cam_K", "K", "intrinsics", "intrinsic", "intrinsic_matrix", "camera_intrinsics", "camera_matrix")
 _LIKE_ANGLE = re.compile("(?i)([hvxy]_?)?(fov|field_of_view)(_?([hvxy]|deg|degrees|rad|vert.*|hor.*))?")
@@ -155,6 +159,7 @@ def unread_beside(
     lines = side_files(folders, read, "name them in each frame by mask_path or depth_file_path")
     keys = dict.fromkeys([*content, *(key for entry in entries for key in entry.own)])
     like = [key for key in keys if key not in _READ and (SIDE.search(key) or _LIKE_LENS.fullmatch(key))]
+    like += [key for key in ("lens",) if key in keys and isinstance(content.get(key), dict)]
 
     def is_said(value: object) -> bool:
         values = value if isinstance(value, list) else [value]
@@ -163,7 +168,7 @@ def unread_beside(
     like = [key for key in like if any(is_said(entry.get(key)) for entry in entries)]
     if not like:
         return lines
-    advice = "masks are read from mask_path, depth from depth_file_path, a lens from k1 k2 k3 p1 p2"
+    advice = "masks are read from mask_path, depth from depth_file_path, a lens from k1 k2 k3 p1 p2 and cx cy"
     said = f"{', '.join(like[:4])}: not read, which seem to be masks, depth or a lens"
     return [f"{file}: {said}; {advice}", *lines]
 

@@ -30,6 +30,7 @@ _UNSAID = re.compile(
 _TAGS = re.compile(r"Video: [^,]*, \w+(?:\(([^)]*)\))?, (\d+)x(\d+)")
 _MATRIX = re.compile(r"\b(?<!/)(bt|smpte|fcc|gbr|ycg|ictcp)")
 _SIDES = re.compile(r"Video: .*[ ,]\d+x\d+[ ,\n]")
+_NO_TIME = ("-9223372036854775808", "NOPTS")  # for a frame without a time stamp
 _TOO_LARGE = re.compile(r"Picture size (\d+x\d+) is invalid")
 _STREAM, _SIZE = re.compile(r"^ *Stream #.*: Video:"), re.compile(r", (\d+)x(\d+)")
 _INTERLACED = re.compile(r"Video: .*\b(top|bottom) (coded )?first\b")
@@ -142,7 +143,7 @@ def _header(video: Path, size: int, changed: int) -> tuple[str, str]:
     if streams[1:]:
         sides = [_SIZE.search(line) for line in streams]
         pixels = [int(match[1]) * int(match[2]) if match else 0 for match in sides]
-        shown = {name: n * len(_stamps(video, name)) for name, n in zip(names, pixels)}
+        shown = {name: n * len(_ticks(video, name)[0]) for name, n in zip(names, pixels)}
         best = max(names, key=shown.get)
         others = {line for name, line in zip(names, streams) if name != best}
         told = "".join(line for line in lines if line not in others)
@@ -153,17 +154,24 @@ def stamps_of(video: Path) -> np.ndarray:
     """Read the times of a video's frames, seconds, ascending, decoding none; empty where it is no video.
 
     Those before 0 were cut off without coding the rest anew, as phones do, and are not shown.
+
+    Raises:
+        SceneError: for a video that does not store the time of each frame, as AVI with B-frames.
     """
-    return _stamps(video, _header_and_stream(video)[1])
+    ticks, unit = _ticks(video, _header_and_stream(video)[1])
+    if without := sum(tick in _NO_TIME for tick in ticks):
+        got = f"{without} of {len(ticks)} without one"
+        raise mismatch(video, "a time stamp of each frame", got, f"type ffmpeg -i {video.name} new.mp4")
+    return np.sort([float(int(tick) * unit) for tick in ticks if tick.isdecimal()])
 
 
-def _stamps(video: Path, stream: str) -> np.ndarray:
+def _ticks(video: Path, stream: str) -> tuple[list[str], Fraction | int]:
+    """Return the time stamp of each frame in a stream, in units of so many seconds."""
     call = [*ffmpeg_reading(video, "-v", "quiet"), "-map", stream, "-c", "copy", "-f", "framecrc", "-"]
     done = subprocess.run(call, capture_output=True)
     lines = done.stdout.decode(errors="replace").splitlines()
     unit = next((Fraction(line.split(":")[1].strip()) for line in lines if line.startswith("#tb 0:")), 1)
-    ticks = (line.split(",")[2].strip() for line in lines if not line.startswith("#"))
-    return np.sort([float(int(tick) * unit) for tick in ticks if tick.isdecimal()])
+    return [line.split(",")[2].strip() for line in lines if not line.startswith("#")], unit
 
 
 def start_of(stamps: np.ndarray, row: int) -> float | None:
