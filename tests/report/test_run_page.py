@@ -429,7 +429,7 @@ def test_a_missing_video_is_made_as_forewarp_render_does(ok, run, tmp_path, monk
     monkeypatch.setattr("forewarp.cli.report.write_film", film)
     for more in (["path=both"], ["path=orbit"]):
         ok("report", "kind=run", f"run={run}", f"out={tmp_path}", *more)
-    assert asked == [("orbit", "mp4", 60)]
+    assert asked == [("orbit", "mp4", None)]
     assert "Once around the scene at one time." in Page((tmp_path / "page.html").read_text()).text
 
 
