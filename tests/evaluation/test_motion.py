@@ -11,7 +11,7 @@ from forewarp.data.module import SceneDataModule
 from forewarp.evaluation import motion
 from forewarp.evaluation.motion import FILE, learned_flows, measure_motion, shape_error, true_flows
 from forewarp.methods.voxel.backward import Deformation
-from forewarp.metrics.geometry import variation
+from forewarp.metrics.variation import variation
 from forewarp.scene.box import Lattice
 from forewarp.scene.cloud import Cloud
 from forewarp.scene.frame import Truth

@@ -3,8 +3,9 @@ import math
 import pytest
 import torch
 
-from forewarp.metrics.geometry import chamfer, depth_delta, end_point_error, variation
+from forewarp.metrics.geometry import chamfer, depth_delta, end_point_error
 from forewarp.metrics.limits import THRESHOLDS
+from forewarp.metrics.variation import variation
 from tests.support import reference
 
 

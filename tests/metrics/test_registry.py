@@ -141,7 +141,11 @@ def test_summary_by_hand():
 @pytest.mark.parametrize(
     ("kind", "scores", "message"),
     [
-        ("spcae", {"psnr": 1.0}, "ability: expected one of space, time, .*, still, crossed, .*, but got 'spcae'"),
+        (
+            "spcae",
+            {"psnr": 1.0},
+            "ability: expected one of space, time, .*, still, crossed, .*, but got 'spcae'",
+        ),
         ("all", {"pnsr": 1.0}, "metric: expected one of psnr, .* but got 'pnsr'"),
         ("all", {"psnr": math.nan}, "psnr: expected a finite score, but got nan"),
     ],

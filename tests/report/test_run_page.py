@@ -365,7 +365,8 @@ def run(fitted, tmp_path_factory):
 
 def test_the_command_renders_the_telling_views(ok, run, tmp_path):
     done = ok("report", "kind=run", f"run={run}", f"out={tmp_path}/shown.html")
-    *told, written = done.out.strip().splitlines()
+    *told, written, link = done.out.strip().splitlines()
+    assert link == f"file://{tmp_path}/shown.html"
     assert re.fullmatch(rf"written: {tmp_path}/shown.html: 0\.\d of at most 4 MB", written)
     assert told[0] == "why it is not better:"
     page = Page((tmp_path / "shown.html").read_text())
@@ -479,7 +480,10 @@ def test_a_run_keeps_its_trainer_unless_one_is_named(ok, run, tmp_path, monkeypa
         (["run=several"], "but got several, which holds 2; choose one: several/ball/base-1.0-seed0, "),
         (["run=a", "megabytes=0.1"], "megabytes: expected a number in [0.3, 1000], but got 0.1"),
         (["run=a", "render=some"], "render: expected true or false, but got 'some'"),
-        (["run=a", "path=spiral"], "path: expected both, trajectories, swing, fixed, orbit or null"),
+        (
+            ["run=a", "path=spiral"],
+            "path: expected lean, stabilised, as_filmed, both, trajectories, swing, fixed, ",
+        ),
     ],
 )
 def test_mistakes_end_in_one_line(refused, in_tmp, arguments, line):

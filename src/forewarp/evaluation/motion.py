@@ -25,7 +25,8 @@ from forewarp.evaluation.images import within
 from forewarp.evaluation.trajectories import moving_points
 from forewarp.files import written_whole
 from forewarp.methods.method import HasBackwardFlow, HasMatter, HasTrajectories
-from forewarp.metrics.geometry import chamfer, variation
+from forewarp.metrics.geometry import chamfer
+from forewarp.metrics.variation import variation
 from forewarp.scene.camera import Camera
 from forewarp.scene.cloud import far_apart
 from forewarp.scene.frame import Frame, Scene, Truth, spread

@@ -1,10 +1,7 @@
-"""Accuracy of geometry: depth maps, shapes and point trajectories; how unsteady a curve is."""
+"""Accuracy of geometry: depth maps, shapes and point trajectories."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -133,18 +130,6 @@ def chamfer(predicted: Tensor, truth: Tensor) -> dict[str, float] | None:
     trees = [cKDTree(given) for given in points]
     accuracy, completeness = (float(trees[1 - i].query(points[i])[0].mean()) for i in (0, 1))
     return {"chamfer": (accuracy + completeness) / 2, "accuracy": accuracy, "completeness": completeness}
-
-
-def variation(values: Sequence[float]) -> float | None:
-    """Divide the total variation of a curve by its range: 1 where it only rises or only falls, more the more
-    often it jumps to and fro; None of a constant, or of fewer than two values.
-
-    >>> variation([0.0, 1.0, 4.0]), variation([0.0, 4.0, 1.0, 4.0])
-    (1.0, 2.5)
-    """
-    values = np.asarray(values, np.float64)
-    extent = float(np.ptp(values)) if len(values) > 1 else 0.0
-    return float(np.abs(np.diff(values)).sum()) / extent if extent > 0 else None
 
 
 def _mean(values: Tensor) -> float | None:

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from forewarp.files import MOST_ARRAYS, read_bytes, replace_file, unpack_arrays
-from forewarp.metrics.geometry import variation
+from forewarp.metrics.variation import variation
 from forewarp.report.figures import COLORS, figure_of, save
 from forewarp.report.results import Row, Runs, in_words
 from forewarp.report.settings import CONDITIONS, SAME
