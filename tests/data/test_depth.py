@@ -248,3 +248,10 @@ def test_bad_depth_of_a_video_is_refused_in_a_line(tmp_path, options, message):
     with refused(message) as caught:
         [frame.load_sensed() for frame in read_scene(tmp_path, "toy", **options).train if frame.load_sensed]
     assert "\n" not in str(caught.value)
+
+
+def test_a_nan_of_the_signalling_kind_is_a_hole(tmp_path):
+    values = np.full((2, 3), 2.0, np.float32)
+    values.view(np.uint32)[0, 0] = 0x7F800001
+    np.save(tmp_path / "a.npy", values)
+    assert read_depth(tmp_path / "a.npy").tolist() == [[0, 2, 2], [2, 2, 2]]

@@ -137,7 +137,8 @@ class StoredDepth:
         size = self.camera.height, self.camera.width
         expected = f"finite depths >= 0 of shape {size}"
         check_shape(values, self.path, expected, *size)
-        depth = values.astype(np.float64)
+        with np.errstate(invalid="ignore"):
+            depth = values.astype(np.float64)
         if not np.isfinite(depth).all() or (depth < 0).any():
             raise mismatch(self.path, expected, f"values from {depth.min()} to {depth.max()}")
         depth[_are_full(values) | nowhere(depth, self.camera.far / self.scale)] = 0
@@ -435,7 +436,10 @@ def _plane(values: object, path: Path, expected: str) -> np.ndarray:
     if len(shape) == 3 and 1 in (shape[0], shape[2]):
         values = values[..., 0] if shape[2] == 1 else values[0]
     check_shape(values, path, expected, None, None)
-    return values
+    if values.dtype.kind != "f":
+        return values
+    with np.errstate(invalid="ignore"):  # from here on no NaN is of the signalling kind
+        return np.where(np.isnan(values), values.dtype.type(np.nan), values)
 
 
 def _are_full(values: np.ndarray) -> np.ndarray:
