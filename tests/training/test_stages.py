@@ -5,6 +5,7 @@ import resource
 import shutil
 import signal
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import lightning
@@ -101,6 +102,14 @@ def test_a_mistake_in_a_later_stage_is_refused_before_anything_is_trained(tmp_pa
     with pytest.raises((TypeError, ValueError), match=text):
         run(tmp_path, plan=[tiny.stage("coarse"), tiny.stage("fine", **wrong)]).fit()
     assert not (tmp_path / "coarse" / "last.ckpt").exists()
+
+
+def test_an_objective_without_its_class_is_named(tmp_path):
+    stage = replace(tiny.stage("fine"), objective={"weights": {}})
+    with pytest.raises(
+        ValueError, match="stage.fine.objective: expected _target_: forewarp.training.objective"
+    ):
+        run(tmp_path, plan=[stage]).check()
 
 
 class Diary(lightning.Callback):

@@ -25,6 +25,7 @@ from forewarp.scene.frame import Scene, instants_of
 from forewarp.training import checkpoints
 from forewarp.training.loggers import RunLoggers
 from forewarp.training.module import DynamicSceneModule
+from forewarp.training.objective import Objective
 from forewarp.training.schedule import Curriculum, Stage
 from forewarp.training.sentinel import Sentinel
 from forewarp.training.stopping import StopRule
@@ -93,6 +94,11 @@ class Run:
         """
         for stage in self.stages:
             settings, objective = stage.settings, stage.objective
+            if not isinstance(objective, Objective):
+                expected = (
+                    f"stage.{settings.name}.objective: expected _target_: {Objective.__module__}.Objective"
+                )
+                raise ValueError(f"{expected}, but got none; add it")
             check = self._of_method(stage, "check")
             check(settings.name, settings.numbers, objective.names, objective.literal)
 

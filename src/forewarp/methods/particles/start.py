@@ -35,9 +35,10 @@ from forewarp.ops.nodes import carry_nodes, pull_nodes, skin_weights, spread_nod
 from forewarp.scene.box import Box, Lattice
 from forewarp.scene.camera import Camera, Lens, Rays
 from forewarp.scene.cloud import Cloud, nearest
-from forewarp.scene.frame import Frame, Scene, instants_of, spread, visual_hull, where_seen
+from forewarp.scene.frame import Frame, Scene, instants_of, sightings, spread, visual_hull, where_seen
 
 _FRAMES = 12  # whose silhouettes carve the hull
+_MOSTLY = 0.75  # share of an image's pixels at rest, from which on masks of rest count
 _VOTERS, _AROUND = 30, 8  # images that say what rests: of the whole film, around the canonical time
 _SURFACE = 1.05  # of the depth that an image shows, up to which a point is its surface
 _EDGE = 5e-3  # share of an image's width by which masks of what moves are enlarged
@@ -131,10 +132,11 @@ def hull_surface(scene: Scene, frames: list[int], count: int) -> Cloud | None:
 def at_rest(scene: Scene, points: Tensor, surface: Callable[[Frame], Tensor] | None = None) -> Tensor:
     """Tell which points (N, 3) of the canonical state rest in the whole film, by masks of its images: bool.
 
-    A point rests unless most of the images in which it is surface show it within masks of what moves: of
-    some that are spread over the film, or of those around the canonical time. Of what is surface in no
-    image, where it lies counts. Where no image says what moves, masks of what rests count; without any, no
-    point rests.
+    Where masks around the canonical time show that most of an image rests in the whole film, these decide
+    (``_by_resting``). Else all images vote. A point rests unless most of the images in which it is surface
+    show it within masks of what moves: of some that are spread over the film, or of those around the
+    canonical time. Of what is surface in no image, where it lies counts. Where no image says what moves,
+    masks of what rests count; without any, no point rests.
 
     Args:
         scene: the film.
@@ -144,6 +146,8 @@ def at_rest(scene: Scene, points: Tensor, surface: Callable[[Frame], Tensor] | N
 
     Cost: some 40 masks, and as many depths.
     """
+    if (rests := _by_resting(scene, points)) is not None:
+        return rests
     has_moving = any(frame.load_moving for frame in scene.train)
     known = [frame for frame in scene.train if (frame.load_moving if has_moving else frame.load_resting)]
     known.sort(key=lambda frame: frame.time)
@@ -168,6 +172,25 @@ def at_rest(scene: Scene, points: Tensor, surface: Callable[[Frame], Tensor] | N
         moves, seen = moves.where(~hidden, moves_behind), seen.where(~hidden, seen_behind)
         rests &= 2 * moves <= seen
     return rests
+
+
+def _by_resting(scene: Scene, points: Tensor) -> Tensor | None:
+    """Tell by masks of what rests in the whole film which points (N, 3) rest: bool; None where these show
+    less than most of an image, as what seems to rest there creeps, as clothes do.
+
+    What moves in none of the first images rests, too, where no mask of rest shows it.
+    """
+    near = sorted(scene.train, key=lambda frame: abs(frame.time - scene.canonical_time))[:_FRAMES]
+    known = [frame for frame in near if frame.load_resting is not None]
+    masks = [frame.load_resting() for frame in known]
+    if not masks or sum(float(mask.float().mean()) for mask in masks) < _MOSTLY * len(masks):
+        return None
+    at_rest, looked = sightings(points, [frame.camera for frame in known], masks)
+    cameras = [frame.camera for frame in near]
+    nowhere = [torch.zeros(camera.height, camera.width, dtype=torch.bool) for camera in cameras]
+    moving = [frame.load_moving() if frame.load_moving else mask for frame, mask in zip(near, nowhere)]
+    moves, seen = sightings(points, cameras, moving)
+    return (seen > 0) & (2 * at_rest >= looked) & (2 * moves <= seen)
 
 
 def covered_pixels(scene: Scene, frames: list[int]) -> float:
