@@ -82,6 +82,7 @@ class SensedDepth:
             depth[nowhere(depth, self.camera.far / self.scale)] = 0
         else:
             depth = self._fitted(depth)
+        depth[depth * self.scale > np.finfo(np.float32).max] = 0
         planes = torch.from_numpy(np.stack([depth * self.scale, trust * (depth > 0)]).astype(np.float32))
         planes = torch.nn.functional.interpolate(planes[None], size, mode="nearest-exact")[0]
         if self.kind != "ray":
