@@ -65,7 +65,7 @@ def test_particles_of_what_moves_are_replaced_at_the_distance_of_the_ground(
 ):
     """It is a body only if all that moves, here 12 % of the image, is small."""
     method, away = before
-    monkeypatch.setattr("forewarp.methods.particles.contact._SMALL", small)
+    monkeypatch.setattr("forewarp.methods.particles.contact.SMALL_MOVERS", small)
     monkeypatch.setattr(method, "light", lambda moment: light)
     mask = masked((6, 12, 6, 14))
     monkeypatch.setattr(
@@ -119,7 +119,7 @@ def test_without_masks_or_known_ground_or_with_measured_depth_nothing_changes(be
 def test_what_was_set_down_follows_nodes(before, monkeypatch, trusts):
     """Masks count only where the stage trusts them; what they show to move never rests."""
     monkeypatch.setattr("forewarp.methods.particles.nodes._FEWEST", 1)  # a few particles are a body
-    monkeypatch.setattr("forewarp.methods.particles.contact._SMALL", 0.2)
+    monkeypatch.setattr("forewarp.methods.particles.contact.SMALL_MOVERS", 0.2)
     method, _ = before
     rests = torch.ones(SIZE, dtype=torch.bool)
     scene = scene_with(masked((6, 12, 6, 14)), load_resting=lambda: rests)
@@ -164,7 +164,7 @@ def test_a_checkpoint_is_loaded_without_a_look_at_masks(before):
 def led(before, monkeypatch):
     """Particles of a fine stage with a body, and their scene."""
     monkeypatch.setattr("forewarp.methods.particles.nodes._FEWEST", 1)
-    monkeypatch.setattr("forewarp.methods.particles.contact._SMALL", 0.2)
+    monkeypatch.setattr("forewarp.methods.particles.contact.SMALL_MOVERS", 0.2)
     rests = torch.ones(SIZE, dtype=torch.bool)
     scene = scene_with(masked((6, 12, 6, 14)), load_resting=lambda: rests)
     numbers = {"rest_by_masks": True, "bodies": 0.5}

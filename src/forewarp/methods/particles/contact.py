@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from forewarp.methods.particles.start import first_values
+from forewarp.methods.particles.start import SMALL_MOVERS, first_values
 from forewarp.ops.grid import dilate
 from forewarp.scene.cloud import Cloud
 from forewarp.scene.frame import Frame, Scene, where_seen
@@ -22,8 +22,8 @@ from forewarp.scene.view import Moment, Rendering, View
 if TYPE_CHECKING:
     from forewarp.methods.particles.model import Particles
 
-# Shares of an image's pixels: below which a patch of a mask is no thing; up to which all that moves is small.
-_SMALLEST, _SMALL = 1e-3, 0.1
+# Share of an image's pixels, below which a patch of a mask is no thing.
+_SMALLEST = 1e-3
 # Share of a thing's height, above its lowest row, within which columns end that touch the ground.
 _LOWEST = 0.2
 # Shares of an image's height: by which a look goes below a thing's lower edge; by which its mask is enlarged,
@@ -90,7 +90,7 @@ def set_down(values: dict[str, Tensor], before: Particles, scene: Scene) -> dict
             empty = value.new_full((count, *value.shape[1:]), -1 if name == "shared" else 0)
             kept[name] = torch.cat([value[~gone], fresh.get(name, empty)])
     of = things[::step, ::step][ground[::step, ::step] > 0]
-    if float(moving.float().mean()) > _SMALL:
+    if float(moving.float().mean()) > SMALL_MOVERS:
         of = torch.full_like(of, -1)
     kept["body_of"] = torch.cat([torch.full((len(kept["means"]) - count,), -1), of])
     kept["set_down"] = torch.arange(len(kept["means"])) >= len(kept["means"]) - count

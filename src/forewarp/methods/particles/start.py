@@ -39,7 +39,7 @@ from forewarp.scene.frame import Frame, Scene, instants_of, sightings, spread, v
 
 _FRAMES = 12  # whose silhouettes carve the hull
 _MOSTLY = 0.75  # share of an image's pixels at rest, from which on masks of rest count
-_LITTLE = 0.1  # share of an image's pixels that move, below which masks of what moves say nothing of rest
+SMALL_MOVERS = 0.1  # share of an image's pixels, up to which all that moves is small, and moves as bodies
 _VOTERS, _AROUND = 30, 8  # images that say what rests: of the whole film, around the canonical time
 _SURFACE = 1.05  # of the depth that an image shows, up to which a point is its surface
 _EDGE = 5e-3  # share of an image's width by which masks of what moves are enlarged
@@ -134,7 +134,7 @@ def at_rest(scene: Scene, points: Tensor, surface: Callable[[Frame], Tensor] | N
     """Tell which points (N, 3) of the canonical state rest in the whole film, by masks of its images: bool.
 
     Where masks around the canonical time show that most of an image rests in the whole film, these decide
-    (``_by_resting``). Else, where at least a tenth of the images moves (what is smaller moves as a body), all
+    (``_by_resting``). Else, where more than a tenth of the images moves (what is small moves as a body), all
     images vote. A point rests unless most of the images in which it is surface show it within masks of what
     moves: of some that are spread over the film, or of those around the canonical time. Of what is surface in
     no image, where it lies counts. Where no image says what moves, masks of what rests count; without any, no
@@ -156,7 +156,7 @@ def at_rest(scene: Scene, points: Tensor, surface: Callable[[Frame], Tensor] | N
     near = sorted(known, key=lambda frame: abs(frame.time - scene.canonical_time))[:_AROUND]
     voters = [known[i] for i in spread(len(known), _VOTERS)]
     moving = [float(frame.load_moving().float().mean()) for frame in voters] if has_moving else [1.0]
-    rests = torch.full((len(points),), bool(known) and sum(moving) >= _LITTLE * len(moving))
+    rests = torch.full((len(points),), bool(known) and sum(moving) > SMALL_MOVERS * len(moving))
     for frames in (voters, near) if bool(rests.any()) else ():
         moves, seen, moves_behind, seen_behind = torch.zeros(4, len(points), dtype=torch.int32)
         for frame in frames:
