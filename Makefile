@@ -48,10 +48,12 @@ demo-lego-complete demo-hypernerf demo-nhr:
 	$(BIN)/forewarp-train experiment=$(subst -,_,$@) run=runs/$@
 	$(BIN)/forewarp-render run=runs/$@ path=both
 
-test: ## run the tests except the slow ones
-	$(BIN)/pytest --no-cov -m "not slow"
+WORKERS ?= logical
+PYTEST = $(BIN)/pytest --no-cov -n $(WORKERS) --maxprocesses 4 --dist loadfile
+test: ## run the tests except the slow ones, on every core up to four [WORKERS=0: in one process]
+	$(PYTEST) -m "not slow"
 test-slow: ## run the slow tests: the page in a browser, killed runs, every method on every dataset, every sweep's jobs, the wheel
-	$(BIN)/pytest --no-cov -m slow
+	$(PYTEST) -m slow
 test-stability: ## run the numerical hard cases and killed runs, slow ones too
 	$(BIN)/pytest --no-cov -m stability tests/stability
 FLOORS := .venv-floors
