@@ -1,6 +1,7 @@
 """Depth that other programs give: of any size, metric or but for a scale and a shift."""
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -18,6 +19,7 @@ from forewarp.data.depth import (
 from forewarp.data.posed_video import FILE, read_scene
 from forewarp.scene.camera import Camera
 from forewarp.scene.frame import Frame
+from tests.support.room import shown, walk
 from tests.support.written_scenes import edit, refused, write_video
 
 
@@ -137,7 +139,8 @@ def test_points_that_never_move_tell_the_unit_of_depth(tmp_path):
     camera = camera_of()
     depth, points = wall(camera)
     load = SensedDepth(tmp_path / "a.npy", camera, known=points)
-    frame = Frame("a", 0.0, camera, None, load_sensed=load)
+    image = torch.zeros(24, 32, 4, dtype=torch.uint8)
+    frame = Frame("a", 0.0, camera, lambda: image, load_sensed=load)
     np.save(tmp_path / "a.npy", depth * 37.0)
     (line,) = doubt_depths([frame], 1.0, None, "toy", "set data.depth_scale={}")
     assert "set data.depth_scale=0.02703, or data.depth_kind=inverse" in line
@@ -255,3 +258,82 @@ def test_a_nan_of_the_signalling_kind_is_a_hole(tmp_path):
     values.view(np.uint32)[0, 0] = 0x7F800001
     np.save(tmp_path / "a.npy", values)
     assert read_depth(tmp_path / "a.npy").tolist() == [[0, 2, 2], [2, 2, 2]]
+
+
+# What views show of depths
+
+
+@pytest.fixture(scope="module")
+def room():
+    return [(camera, *shown(camera)) for camera in walk()]
+
+
+def read_room(folder, room, change, **options):
+    """Frames of the room whose files of depth are changed, and what is said of these."""
+    frames = []
+    for k, (camera, image, depth) in enumerate(room):
+        np.save(folder / f"{k}.npy", change(depth.copy()))
+        pixels = torch.from_numpy(np.concatenate([image, np.full((*depth.shape, 1), 255, np.uint8)], 2))
+        load = SensedDepth(folder / f"{k}.npy", camera, **options)
+        frames.append(Frame(str(k), k / 7, camera, lambda pixels=pixels: pixels, load_sensed=load))
+    return frames, doubt_depths(frames, 1.0, None, "toy", "set data.depth_scale={}")
+
+
+def unseen(depth, number):
+    depth[3:16, 6:26] = depth[::7, ::5] = number
+    return depth
+
+
+@pytest.mark.parametrize(
+    ("change", "line"),
+    [
+        (lambda depth: depth, None),
+        (lambda depth: np.round(depth, 3), None),
+        (lambda depth: unseen(depth, 8.0), "are 8, the largest of their image, where other views do not see"),
+        (lambda depth: np.minimum(depth, 3.0), "are 3, the largest of their image, where other views do not"),
+        (lambda depth: unseen(depth, depth.max()), "and the like, the largest of their image, where other"),
+        (lambda depth: depth[::-1], "agree much better if depths are upside down; turn them as their images"),
+        (lambda depth: depth[:, ::-1], "agree much better if depths are mirrored; turn them"),
+        (lambda depth: depth[::-1, ::-1], "agree much better if depths are turned by half; turn them"),
+        (lambda depth: 1.4 * depth, "if depths are about 0.7 times as far; set data.depth_scale=0.7"),
+        (lambda depth: 0.5 * depth, "if depths are about 2 times as far; set data.depth_scale=2"),
+    ],
+)
+def test_what_views_contradict_in_depths_is_a_hole_or_named(tmp_path, room, change, line):
+    frames, lines = read_room(tmp_path, room, change)
+    assert len(lines) == (line is not None)
+    assert (line or "") in "".join(lines)
+    is_hole = "taken for holes" in "".join(lines)
+    for frame, (*_, depth) in zip(frames, room):
+        file = change(depth.copy())
+        expected = file < file.max() if is_hole else file > 0
+        assert np.array_equal(frame.load_sensed()[0].numpy() > 0, expected)
+
+
+def test_a_limit_that_views_do_not_contradict_is_kept_and_said(tmp_path):
+    cameras = walk(1) * 4  # a camera that stands still
+    frames, (line,) = read_room(
+        tmp_path, [(c, *shown(c)) for c in cameras], lambda depth: np.minimum(depth, 3)
+    )
+    assert line.endswith("are 3, the largest of their image; write 0 there if that is a sensor's limit")
+    assert frames[0].load_sensed()[0].min() > 0
+
+
+def test_levels_of_confidence_are_told_by_all_files(tmp_path, room):
+    for most, trust in ((2, [0, 0.5, 1]), (255, [0, 1 / 255, 2 / 255])):
+        for k in range(8):
+            levels = np.tile(np.array([0, 1, 2], np.uint8), (48, 1))
+            levels = np.pad(levels, ((0, 0), (0, 61)), constant_values=most if k == 3 else 2)
+            np.save(tmp_path / f"trust{k}.npy", levels)
+        frames = [Frame("a", 0.0, c, None, load_sensed=None) for c, *_ in room]
+        for k, (camera, _, depth) in enumerate(room):
+            np.save(tmp_path / f"{k}.npy", depth)
+            load = SensedDepth(tmp_path / f"{k}.npy", camera, confidence=tmp_path / f"trust{k}.npy")
+            frames[k] = Frame(str(k), k / 7, camera, lambda: torch.zeros(48, 64, 4), load_sensed=load)
+        doubt_depths(frames, 1.0, None, "toy", "")
+        for frame in frames:
+            assert frame.load_sensed()[1, 0, :3].tolist() == pytest.approx(trust)
+    np.save(tmp_path / "trust5.npy", np.full((48, 64), 77, np.uint8))
+    frames[5].load_sensed.levels = True
+    with refused("trust5.npy: expected confidences from 0 to 1, .* but got .* write them alike in all files"):
+        replace(frames[5].load_sensed)()

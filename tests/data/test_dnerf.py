@@ -216,13 +216,14 @@ def test_which_kind_exact_depth_is_follows_from_near_views(tmp_path, kind, other
         assert "taken for depth along the pixels' rays; if it is along the optical axis, set" in line
 
 
-@pytest.mark.parametrize("none", [1e10, 65504.0, 1000.0])
+@pytest.mark.parametrize("none", [1e10, 65504.0, 1000.0, 5.0])
 def test_a_renderers_number_for_no_depth_is_background_and_said(tmp_path, none):
     write_dnerf(tmp_path / "toy", (64, 64), test=ball_shots("ray", none))
     scene = read_scene(tmp_path, "toy", depth_kind="ray")
     for frame, shot in zip(scene.test, ball_shots("ray")):
         assert torch.equal(frame.load_depth(), shot.depth)
-    assert f"are {none:.6g}, beyond far, 6: taken for holes" in scene.protocol["assumed"][0]
+    why = "beyond far, 6" if none > 6 else "the largest of their image, where other views do not see it"
+    assert f"are {none:.6g}, {why}: taken for holes" in scene.protocol["assumed"][0]
 
 
 def test_depth_in_another_unit_is_told_with_its_scale(tmp_path):

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import permutations
 from statistics import median
 
 import torch
 from torch import Tensor
-from torch.nn.functional import avg_pool2d, grid_sample
+from torch.nn.functional import avg_pool2d, grid_sample, interpolate
 
 from forewarp.scene.camera import Camera
 
@@ -17,6 +17,9 @@ _PLANES, _NEIGHBOURS, _PATCH = 32, 2, 3
 _TEXTURED = 0.02  # deviation of grey in [0, 1] around a pixel, below which any depth fits it
 _LEAST_PIXELS, _SAMPLES = 100, 2000  # of a pair of views: fewest that tell, most that are looked at
 _APART = 1e-3  # least difference of two readings, as a share, that tells
+_WORST = 0.2  # difference of colours in [0, 1] from which on they are of two things
+_LIKELIER, _MOST_PAIRS = 0.75, 0.8  # errors of a likelier reading as a share of the other's; share of pairs
+_FEW = 20  # pixels of a pair of views, fewer of which tell nothing of their largest depths
 _OCCLUDED, _OUTLIER = 0.15, 4.0  # share and multiple of the median error from which another thing is seen
 
 
@@ -84,13 +87,7 @@ def leaning(
         about 0 where the first is right and 1 where the second is, and the share by which distances of each
         differ, medians of all pairs; None where no two views show enough of the same in which both differ.
     """
-    clouds = []  # of both readings, for each view
-    for camera, *both in zip(cameras, *readings):
-        there = (both[0] * both[1]).flatten().nonzero()[:, 0]
-        there = there[:: max(1, len(there) // _SAMPLES)]
-        rays = camera.rays(there, torch.float64)
-        away = [distances.flatten()[there].double()[:, None] for distances in both]
-        clouds.append([rays.origins + n * rays.directions for n in away])
+    clouds = [_points(camera, both)[1] for camera, *both in zip(cameras, *readings)]
     pairs = [(clouds[k], view) for k, view in permutations(range(len(cameras)), 2)]
     pairs += [] if known is None else [([known, known], view) for view in range(len(cameras))]
     found = [_lean(cameras[view], [given[view] for given in readings], both) for both, view in pairs]
@@ -134,3 +131,94 @@ def _lean(
         return None
     share = float((first[near] * apart).sum() / apart.square().sum())
     return share, float(first.abs().median()), float(second.abs().median())
+
+
+def small_image(pixels: Tensor, side: int = SIDE) -> Tensor:
+    """Make an image uint8 (H, W, C) ``side`` pixels long: (h, w, 3) in [0, 1]."""
+    height, width = (max(1, round(n * side / max(pixels.shape[:2]))) for n in pixels.shape[:2])
+    planes = pixels[..., :3].permute(2, 0, 1)[None].float() / 255
+    return interpolate(planes, (height, width), mode="area")[0].permute(1, 2, 0)
+
+
+def _points(camera: Camera, readings: Sequence[Tensor]) -> tuple[Tensor, list[Tensor]]:
+    """Return some pixels (P,) of a view that have distances (H, W) along their rays in all readings, and the
+    points (P, 3) float64 that they show in each.
+    """
+    there = torch.stack([distances > 0 for distances in readings]).all(0).flatten().nonzero()[:, 0]
+    there = there[:: max(1, len(there) // _SAMPLES)]
+    rays = camera.rays(there, torch.float64)
+    away = [distances.flatten()[there].double()[:, None] for distances in readings]
+    return there, [rays.origins + n * rays.directions for n in away]
+
+
+def _seen(camera: Camera, points: Tensor) -> tuple[Tensor, Tensor]:
+    """Return where a camera sees points (P, 3): pixels (P, 2), and which are in its image, bool (P,)."""
+    pixel, z = camera.project(points)
+    size = pixel.new_tensor([camera.width, camera.height])
+    return pixel, (z > 0) & (pixel >= 0).all(-1) & (pixel < size).all(-1)
+
+
+def warp_errors(
+    cameras: Sequence[Camera], images: Sequence[Tensor], readings: Sequence[Sequence[Tensor]]
+) -> list[list[float]]:
+    """Return how far colours differ where distances put pixels of one view into another.
+
+    Args:
+        cameras: at the size of the images.
+        images: (H, W, 3) in [0, 1].
+        readings: each of (H, W) along the rays of each view, 0 where there is none.
+
+    Returns:
+        of each reading for each pair a mean in [0, 1], of pixels that have a distance in all readings;
+        infinite where the one shows next to nothing of the other.
+    """
+    clouds = [_points(camera, distances) for camera, *distances in zip(cameras, *readings)]
+    errors = [[] for _ in readings]
+    for k, view in permutations(range(len(cameras)), 2):
+        there, points = clouds[k]
+        for n, of_reading in enumerate(errors):
+            pixel, inside = _seen(cameras[view], points[n])
+            if int(inside.sum()) < _LEAST_PIXELS:
+                of_reading.append(torch.inf)
+                continue
+            grid = 2 * pixel[inside] / pixel.new_tensor([cameras[view].width, cameras[view].height]) - 1
+            shown = images[view].double().permute(2, 0, 1)[None]
+            options = {"align_corners": False, "padding_mode": "border"}
+            shown = grid_sample(shown, grid[None, None], **options)[0, :, 0].T
+            given = images[k].reshape(-1, 3)[there][inside]
+            of_reading.append(float((shown - given).abs().mean(-1).clamp(max=_WORST).mean()))
+    return errors
+
+
+def likeliest(mine: Sequence[float], others: Mapping[str, Sequence[float]]) -> str | None:
+    """Name the reading under which pairs of views differ least, if nearly all differ much less than as read.
+
+    Args:
+        mine: errors of pairs of views as read, see ``warp_errors``.
+        others: of the same pairs, by the names of other readings.
+    """
+    likelier = {}
+    for name, errors in others.items():
+        pairs = [(min(a, _WORST), b) for a, b in zip(mine, errors) if b < torch.inf]
+        less = sum(b < a for a, b in pairs)
+        if len(pairs) < max(len(mine) / 2, 1) or less < _MOST_PAIRS * len(pairs):
+            continue
+        now, then = map(median, zip(*pairs))
+        if then < _LIKELIER * now:
+            likelier[name] = then
+    return min(likelier, key=likelier.get, default=None)
+
+
+def plane_error(cameras: Sequence[Camera], distances: Sequence[Tensor]) -> float | None:
+    """Return by which share, at most, distances (H, W) along the rays of two views differ where both have
+    one, 0 where there is none; None where no two do.
+    """
+    clouds, errors = [_points(camera, [away])[1][0] for camera, away in zip(cameras, distances)], []
+    for k, view in permutations(range(len(cameras)), 2):
+        pixel, inside = _seen(cameras[view], clouds[k])
+        column, row = pixel[inside].long().unbind(-1)
+        given = distances[view][row, column].double()
+        off = (given / (clouds[k][inside] - cameras[view].center).norm(dim=-1) - 1).abs()[given > 0]
+        if len(off) >= _FEW:
+            errors.append(float(off.median()))
+    return max(errors, default=None)

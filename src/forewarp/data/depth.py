@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from forewarp.data.agreement import leaning
+from forewarp.data.agreement import leaning, likeliest, plane_error, small_image, warp_errors
 from forewarp.data.arrays import check_shape, load_numpy
 from forewarp.data.files import existing, mismatch
 from forewarp.data.images import CACHE, by, read_gray16, read_image
@@ -33,9 +33,23 @@ _LEANS = 0.65, 1.5  # between which the other kind is right
 _BEYOND = 2.0  # share of near and far within which the median of depths of the right unit lies
 _NOWHERE = 10.0  # multiple of far, beyond which nothing is measured
 _REPEATED, _SEVERAL = 0.002, 2  # share and number of pixels of the largest depth, from which on it is none
+_BELOW, _STANDS_OUT = 0.02, 5  # share below the largest, and how many times as often as any depth there it is
+_PLACED = 2e-3  # share by which the largest depths of views contradict each other if they are none
+_COMPARED, _BESIDE = (
+    3,
+    ((0, 0), (24, 2), (8, 6)),
+)  # views whose colours are compared, with others: share, least
+_SIDE = 128  # pixels of these
 _UNITS = (1.0, MILLIMETRES, 1e-2, 1e2, 1e3, 2e-4, 1 / 256, 0.0254, 0.3048)  # that depth is written in
 _SAME_UNIT = 0.03
 _DOUBTED = 0.5  # confidence above which some depths are
+_TRUSTED = 8  # files that tell whether confidences are levels, and of which the largest depths are looked at
+_TURNED = {  # what else may be in files of depth
+    "upside down": lambda away: away.flip(0),
+    "mirrored": lambda away: away.flip(1),
+    "turned by half": lambda away: away.flip(0, 1),
+}
+_FACTORS = (0.5, 0.7, 1.4, 2.0)  # by which depths may be off, where near and far allow it
 
 
 @dataclass(eq=False)
@@ -55,6 +69,8 @@ class SensedDepth:
             as depth or ``inverse`` as 1 / depth along the axis: what is 0 or below is no hole then, and what
             lies at ``known`` points tells scale and shift.
         known: (N, 3), world units. An image that shows too few of them, or contradicts them, is all holes.
+        levels: whole numbers of confidence are ARKit's levels, else bytes; None: as this file alone tells.
+        ends: a metric depth that stands out as the image's largest is where the sensor saw nothing, a hole.
     """
 
     path: Path
@@ -63,6 +79,8 @@ class SensedDepth:
     confidence: Path | None = None
     kind: str = "axis"
     known: Tensor | None = None
+    levels: bool | None = None
+    ends: bool = False
 
     def __call__(self) -> Tensor:
         """Give both; SceneError where a file holds anything else."""
@@ -70,23 +88,39 @@ class SensedDepth:
 
     def _decode(self) -> Tensor:
         depth = read_depth(self.path, signed=self.kind not in METRIC)
-        trust = np.ones_like(depth) if self.confidence is None else _read_confidence(self.confidence)
+        if self.confidence is None:
+            trust = np.ones_like(depth)
+        else:
+            trust = _read_confidence(self.confidence, self.levels)
         if trust.shape != depth.shape:
             expected = f"{by(depth.shape[::-1])} confidences as {self.path.name}"
             raise mismatch(self.confidence, expected, by(trust.shape[::-1]))
-        camera, size = self.camera, (self.camera.height, self.camera.width)
+        size = self.camera.height, self.camera.width
         if abs(depth.shape[0] * size[1] - depth.shape[1] * size[0]) > max(*depth.shape, *size):
             expected = f"depths of the proportions of its image, {by(size[::-1])} pixels"
             raise mismatch(self.path, expected, by(depth.shape[::-1]))
         if self.kind in METRIC:
-            depth[nowhere(depth, self.camera.far / self.scale)] = 0
+            depth[nowhere(depth, self.camera.far / self.scale, ends=self.ends)] = 0
         else:
             depth = self._fitted(depth)
+        return self._placed(depth, trust)
+
+    def largest(self) -> Tensor:
+        """Return the distances (H, W) along the rays, world units, of the depths that stand out as the
+        largest, 0 elsewhere.
+        """
+        depth = read_depth(self.path)
+        depth[nowhere(depth, self.camera.far / self.scale)] = 0
+        return self._placed(np.where(_stands_out(depth), depth, 0), np.ones_like(depth))[0]
+
+    def _placed(self, depth: np.ndarray, trust: np.ndarray) -> Tensor:
+        """Make planes of the camera's size of depths and confidences of the file's."""
+        size = self.camera.height, self.camera.width
         depth[depth * self.scale > np.finfo(np.float32).max] = 0
         planes = torch.from_numpy(np.stack([depth * self.scale, trust * (depth > 0)]).astype(np.float32))
         planes = torch.nn.functional.interpolate(planes[None], size, mode="nearest-exact")[0]
         if self.kind != "ray":
-            planes[0] /= _cosines(*camera.inner)
+            planes[0] /= _cosines(*self.camera.inner)
         return planes
 
     def at_known(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -123,13 +157,15 @@ class StoredDepth:
         halve: give half the size.
         scale: world units for one of the file; None: 1, refused for a PNG.
         kind: in the file along the optical ``axis`` or each pixel's ``ray``.
+
+    ``ends``, False at first, is as of ``SensedDepth``.
     """
 
     def __init__(self, path: Path, camera: Camera, halve: bool, scale: float | None, kind: str) -> None:
         if path.suffix == ".png" and scale is None:
             expected = "depth_scale in the transforms file, world units for one step of a 16-bit depth"
             raise mismatch(path, expected, "none")
-        self.path, self.camera, self.halve, self.kind = path, camera, halve, kind
+        self.path, self.camera, self.halve, self.kind, self.ends = path, camera, halve, kind, False
         self.scale = 1.0 if scale is None else scale
 
     def __call__(self) -> Tensor:
@@ -142,7 +178,7 @@ class StoredDepth:
             depth = values.astype(np.float64)
         if not np.isfinite(depth).all() or (depth < 0).any():
             raise mismatch(self.path, expected, f"values from {depth.min()} to {depth.max()}")
-        depth[_are_full(values) | nowhere(depth, self.camera.far / self.scale)] = 0
+        depth[_are_full(values) | nowhere(depth, self.camera.far / self.scale, ends=self.ends)] = 0
         if not (depth.max() * self.scale <= np.finfo(np.float32).max):
             raise mismatch(self.path, expected, f"values up to {depth.max() * self.scale}")
         depth = torch.from_numpy((depth * self.scale).astype(np.float32))
@@ -180,9 +216,10 @@ def line_through(given: np.ndarray, true: np.ndarray) -> tuple[float, float] | N
     return float(a), float(b)
 
 
-def nowhere(depth: np.ndarray, far: float) -> np.ndarray:
+def nowhere(depth: np.ndarray, far: float, *, ends: bool = False) -> np.ndarray:
     """Tell which depths (H, W) are a program's number for none: the largest, if several pixels have just that
-    and it is beyond ``far``, and what is beyond ten times that, unless most depths are. Returns bool (H, W).
+    and it is beyond ``far``, or with ``ends`` stands out, and what is beyond ten times that, unless most
+    depths are. Returns bool (H, W).
 
     >>> nowhere(np.array([[2.0, 3, 65.535, 65.535]]), 10.0).tolist()
     [[False, False, True, True]]
@@ -191,7 +228,21 @@ def nowhere(depth: np.ndarray, far: float) -> np.ndarray:
     rest = depth[(depth > 0) & ~largest]
     if not rest.size or np.median(rest) > _NOWHERE * far:  # of another unit
         return np.zeros_like(largest)
-    return largest | (depth > _NOWHERE * far)
+    none = largest | (depth > _NOWHERE * far)
+    return none | _stands_out(np.where(none, 0, depth)) if ends else none
+
+
+def _stands_out(depth: np.ndarray) -> np.ndarray:
+    """Tell which of depths (H, W) are the largest, if many more pixels have just that than any depth a little
+    below it, as of a sensor that writes its limit where it sees nothing.
+    """
+    largest = _repeated(depth)
+    if not largest.any() or not ((depth > 0) & ~largest).any():
+        return np.zeros_like(largest)
+    top = depth.max()
+    below = depth[(depth < top) & (depth > (1 - _BELOW) * top)]
+    most = np.unique(below, return_counts=True)[1].max(initial=0)
+    return largest & bool(largest.sum() > _STANDS_OUT * most)
 
 
 def _repeated(depth: np.ndarray) -> np.ndarray:
@@ -211,7 +262,8 @@ def doubt_depths(
     usual: str = "axis",
 ) -> list[str]:
     """Say in lines which numbers of metric depths are taken for holes, that hardly any is trusted, and that
-    depths are in another unit; else doubt their kind.
+    depths are in another unit or turned; else doubt their kind. What only all files together tell is settled
+    for each before: ``levels`` and ``ends`` of ``SensedDepth``.
 
     Args:
         frames: in the order of time; some of those with depth are read.
@@ -226,19 +278,22 @@ def doubt_depths(
         SceneError: as ``doubt_kind``.
     """
     frames = [frame for frame in frames if frame.load_sensed is not None]
+    _settle_levels([frame.load_sensed for frame in frames])
     if kind not in (*METRIC, None) or not frames:
         return []
+    limits = _settle_ends([frame.load_sensed for frame in frames], where)
     loads = [frames[i].load_sensed for i in spread(len(frames), _LOOKED_AT)]
     near, far = loads[0].camera.near / world, loads[0].camera.far / world
     holes, kept, pixels = {"the largest of their type": [], f"beyond far, {far:.4g}": []}, [], 0
     for load in loads:
         values, depth = _numbers_in(load.path), read_depth(load.path)
         away = nowhere(depth, load.camera.far / load.scale)
+        depth[load.ends & _stands_out(np.where(away, 0, depth))] = 0
         for found, mask in zip(holes.values(), (_are_full(values), away)):
             found.append(values[mask].astype(np.float64))
         kept.append(depth[(depth > 0) & ~away] * load.scale / world)
         pixels += depth.size
-    lines = []
+    lines = limits
     for why, found in holes.items():
         if (found := np.concatenate(found)).size:
             most = Counter(found.tolist()).most_common(1)[0][0]
@@ -260,7 +315,89 @@ def doubt_depths(
     if usual == "axis":
         chosen = {i + n for i in spread(len(frames), _VIEWS) for n in _NEXT if i + n < len(frames)}
         groups = [[frames[i] for i in sorted(chosen)]]
+    if doubt := _doubt_colors(frames, groups, world, where, unit, usual):
+        return lines + doubt
     return lines + doubt_kind(groups, loads[0].known, kind, where, usual)
+
+
+def _settle_levels(loads: Sequence[SensedDepth]) -> None:
+    """Tell once for all depths whether whole numbers of confidence are levels or bytes, by some files."""
+    trusted = [load for load in loads if load.confidence is not None]
+    looked = [_confidences_in(trusted[i].confidence) for i in spread(len(trusted), _TRUSTED)]
+    levels = all(values.max() <= LEVELS for values in looked if values.dtype.kind != "f")
+    for load in trusted:
+        load.levels = levels
+
+
+def _settle_ends(loads: Sequence[SensedDepth], where: object) -> list[str]:
+    """Take the largest depth of each image for a hole where it stands out in several and cannot be where each
+    of them has it; say so in a line, or that it is doubtful where views do not tell.
+    """
+    some = [loads[i] for i in spread(len(loads), _TRUSTED)]
+    ends = [load.largest() for load in some]
+    kept = [(load, end) for load, end in zip(some, ends) if bool(end.any())]
+    if len(kept) < max(_SEVERAL, len(some) / 2):
+        return []
+    share = sum(float((end > 0).double().mean()) for end in ends) / len(ends)
+    error = plane_error([load.camera for load, _ in kept], [end for _, end in kept])
+    tops = [f"{float(np.max(_shown(load))):.6g}" for load, _ in kept]
+    top = tops[0] if len({*tops}) == 1 else f"{tops[0]} and the like"
+    line = f"{where}: {share:.2%} of the depths looked at are {top}, the largest of their image"
+    if error is None or error <= _PLACED:
+        is_same = len({*tops}) == 1
+        advice = "write 0 there if that is a sensor's limit"
+        return [f"{line}; {advice}"] if is_same else []
+    for load in loads:
+        load.ends = True
+    return [f"{line}, where other views do not see it: taken for holes"]
+
+
+def _shown(load: SensedDepth) -> np.ndarray:
+    """Return the depths (P,) of a file within reach of its camera's far."""
+    depth = read_depth(load.path)
+    return depth[~nowhere(depth, load.camera.far / load.scale)]
+
+
+def _doubt_colors(
+    frames: Sequence[Frame],
+    groups: Sequence[Sequence[Frame]],
+    world: float,
+    where: object,
+    unit: str,
+    usual: str,
+) -> list[str]:
+    """Say in a line that colours of views agree by depths only if these are turned, or multiplied.
+
+    Args:
+        frames, world, where, unit, usual: see ``doubt_depths``.
+        groups: of frames that are compared; of films others are.
+    """
+    if usual == "axis":
+        beside = [max(least, len(frames) // share) if share else 0 for share, least in _BESIDE]
+        firsts = spread(len(frames), _COMPARED)
+        groups = [[frames[i + n] for n in beside if i + n < len(frames)] for i in firsts]
+    views = {}
+    for frame in {id(frame): frame for group in groups for frame in group}.values():
+        image = small_image(frame.load(), _SIDE)
+        camera = frame.camera.resized(image.shape[1], image.shape[0])
+        away = replace(frame.load_sensed, camera=camera, confidence=None)._decode()[0]
+        views[id(frame)] = camera, image, away
+    readings, scale = {"": (lambda away: away, "")}, frames[0].load_sensed.scale / world
+    for how, turned in _TURNED.items():
+        readings[f"are {how}"] = turned, "turn them as their images are"
+    for factor in _FACTORS:
+        advice = unit.format(f"{factor * scale:.2g}")
+        readings[f"are about {factor:g} times as far"] = (lambda away, by=factor: by * away), advice
+    errors: list[list[float]] = [[] for _ in readings]
+    for group in groups:
+        cameras, images, away = zip(*(views[id(frame)] for frame in group))
+        found = warp_errors(cameras, images, [[*map(read, away)] for read, _ in readings.values()])
+        errors = [before + more for before, more in zip(errors, found)]
+    how = likeliest(errors[0], dict(zip(readings, errors)))
+    if how is None:
+        return []
+    line = f"colours of neighbouring views agree much better if depths {how}"
+    return [f"{where}: {line}; {readings[how][1]}"]
 
 
 def _near_pairs(frames: Sequence[Frame]) -> list[list[Frame]]:
@@ -448,16 +585,24 @@ def _are_full(values: np.ndarray) -> np.ndarray:
     return values == (np.finfo if values.dtype.kind == "f" else np.iinfo)(values.dtype).max
 
 
-def _read_confidence(path: Path) -> np.ndarray:
-    """Read confidences (H, W) in [0, 1]: levels and bytes are whole numbers."""
+def _confidences_in(path: Path) -> np.ndarray:
+    """Read the numbers (H, W) of a file of confidences."""
     values = read_image(path)[..., 0].numpy() if path.suffix == ".png" else load_numpy(path)
     if getattr(values, "dtype", np.dtype(float)).kind == "b":
         values = values.astype(np.float64)
-    values = _plane(values, path, "confidences (H, W)")
-    most = 1.0 if values.dtype.kind == "f" else float(LEVELS if values.max() <= LEVELS else 255)
+    return _plane(values, path, "confidences (H, W)")
+
+
+def _read_confidence(path: Path, levels: bool | None) -> np.ndarray:
+    """Read confidences (H, W) in [0, 1]: levels and bytes are whole numbers; see ``SensedDepth``."""
+    values = _confidences_in(path)
+    levels = values.max() <= LEVELS if levels is None else levels
+    most = 1.0 if values.dtype.kind == "f" else float(LEVELS if levels else 255)
     if not (values.min() >= 0 and values.max() <= most):
         got = f"values from {values.min():g} to {values.max():g}"
-        raise mismatch(path, "confidences from 0 to 1, or levels 0, 1, 2", got)
+        expected = "confidences from 0 to 1, or levels 0, 1, 2"
+        advice = "write them alike in all files" if values.dtype.kind != "f" else ""
+        raise mismatch(path, expected, got, advice)
     return np.asarray(values, np.float64) / most
 
 

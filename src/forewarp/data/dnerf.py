@@ -173,7 +173,10 @@ def read_scene(
     train, val, test = (tuple(map(frame, records[split])) for split in SPLITS)
     deep = sorted((f for f in (*train, *val, *test) if f.load_depth), key=lambda f: f.time)
     advice = "write depth_scale: {} beside the frames"
-    assumed += doubt_depths([*map(_sensed, deep)], space.scale, depth_kind, folder, advice, usual="ray")
+    sensed = [*map(_sensed, deep)]
+    assumed += doubt_depths(sensed, space.scale, depth_kind, folder, advice, usual="ray")
+    for frame, measured in zip(deep, sensed):
+        frame.load_depth.ends = measured.load_sensed.ends
     if deep and depth_kind is None and not any((place / RECORD).is_file() for place in (folder, Path(root))):
         line = "depth_file_path is taken for depth along the pixels' rays"
         assumed.append(f"{folder}: {line}; if it is along the optical axis, set data.depth_kind=axis")

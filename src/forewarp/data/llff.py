@@ -5,10 +5,11 @@ from __future__ import annotations
 import math
 from pathlib import Path
 
+from forewarp.data.agreement import small_image
 from forewarp.data.cameras import opengl_rows
 from forewarp.data.files import SUFFIXES, mismatch
 from forewarp.data.images import by, inspect_image, read_image
-from forewarp.data.multicam import FILE, ordered_rows, small_image
+from forewarp.data.multicam import FILE, ordered_rows
 from forewarp.data.names import in_order
 
 _SAME_SHAPE = 0.02  # share by which the proportions of images and rows may differ

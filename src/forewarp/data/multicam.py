@@ -23,7 +23,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from forewarp.data.agreement import SIDE, photo_error
+from forewarp.data.agreement import photo_error, small_image
 from forewarp.data.arrays import check_shape, load_numpy
 from forewarp.data.cameras import MOST_UNITS, box_of, number_or_none, pose_of, space_of
 from forewarp.data.directions import inverted, refuse_other_readings
@@ -324,13 +324,6 @@ def ordered_rows(
     best = min(errors, key=errors.get)
     line = f"rows are taken in the order of names by {best}, as neighbouring views agree so; else {key}"
     return cameras if best == "number" else by_text, [f"{path}: {line}"]
-
-
-def small_image(pixels: Tensor) -> Tensor:
-    """Make an image uint8 (H, W, C) a few pixels wide: (h, w, 3) in [0, 1]."""
-    height, width = (max(1, round(side * SIDE / max(pixels.shape[:2]))) for side in pixels.shape[:2])
-    planes = pixels[..., :3].permute(2, 0, 1)[None].float() / 255
-    return torch.nn.functional.interpolate(planes, (height, width), mode="area")[0].permute(1, 2, 0)
 
 
 def _first_image(track: _Track) -> Tensor:
