@@ -18,6 +18,7 @@ from forewarp.capture.record3d import capture_record3d, summary
 from forewarp.data.files import SceneError
 from forewarp.data.posed_video import read_scene
 from tests.support.captures import step
+from tests.support.room import shown, walk
 
 SIZE, DEPTH = (36, 48), (9, 12)  # width, height
 
@@ -110,7 +111,12 @@ def test_frames_may_be_fewer_and_have_times_and_lenses_of_their_own(tmp_path):
         ({"rgbd/4.depth": b"nothing"}, "rgbd/4.depth: expected data compressed by LZFSE, but got others"),
         ({"rgbd/4.depth": lzfse.compress(bytes(8))}, "4.depth: expected 9 x 12 numbers as dw and dh say"),
         ({"rgbd/4.jpg": None}, "rgbd/4.jpg: expected this file in the archive, but got none"),
-        ({"w": 40}, "000000.jpg: expected 40 x 48 pixels, but got 36 x 48"),
+        (
+            {"dw": 12, "dh": 9},
+            "dw, dh: expected the proportions of w and h, 36 x 48, but got 12 x 9; exchange",
+        ),
+        ({"K": [100.0, 0, 0, 0, 102.0, 0, 36.0, 48.0, 1]}, "point of frame 0: expected .* 2 times as large"),
+        ({"w": 37}, "000000.jpg: expected 37 x 48 pixels, but got 36 x 48"),
     ],
 )
 def test_what_is_wrong_in_a_scan_is_told_in_a_line(tmp_path, changes, message):
@@ -155,3 +161,33 @@ def test_times_may_be_of_1970_and_must_grow(tmp_path):
         SceneError, match="frameTimestamps: expected seconds that grow, but got .* of frame 4"
     ):
         captured(write_scan(tmp_path / "b.r3d", frameTimestamps=[0, 1, 2, 3, 3, 4, 5, 6, 7]), tmp_path / "b")
+
+
+def quaternion(pose):
+    """x, y, z, w of a rotation (3, 3) with OpenGL's axes."""
+    axis = np.array([pose[2, 1] - pose[1, 2], pose[0, 2] - pose[2, 0], pose[1, 0] - pose[0, 1]])
+    w = np.sqrt(1 + np.trace(pose)) / 2
+    return [*(axis / (4 * w)).tolist(), float(w)]
+
+
+@pytest.mark.parametrize("w_first", [False, True])
+def test_the_orders_of_quaternions_and_of_the_matrix_are_told(tmp_path, w_first):
+    files, rows, cameras = {}, [], walk(10, (48, 64))
+    for i, camera in enumerate(cameras):
+        pixels, depth = shown(camera)
+        image = io.BytesIO()
+        Image.fromarray(pixels).save(image, "JPEG", quality=95)
+        files |= {f"rgbd/{i}.jpg": image.getvalue(), f"rgbd/{i}.depth": lzfse.compress(depth.tobytes())}
+        files[f"rgbd/{i}.conf"] = None
+        x, y, z, w = quaternion((camera.camera_to_world[:3, :3] * torch.tensor([1, -1, -1])).numpy())
+        rows.append([*((w, x, y, z) if w_first else (x, y, z, w)), *camera.center.tolist()])
+    focal = cameras[0].fx
+    about = {"w": 48, "h": 64, "dw": 48, "dh": 64, "K": [focal, 0, 24, 0, focal, 32, 0, 0, 1], "poses": rows}
+    facts = captured(write_scan(tmp_path / "a.r3d", 10, **files, **about), tmp_path / "a")
+    assert ("w, x, y, z, as neighbouring" in summary(facts)[1]) == w_first
+    scene = read_scene(tmp_path, "a", normalise=False)
+    assert not [line for line in scene.protocol.get("assumed", []) if "colours" in line]
+    for frame in scene.train:
+        expected = cameras[int(frame.name[-6:])]
+        assert (frame.camera.fx, frame.camera.cx, frame.camera.cy) == (focal, 24, 32)
+        torch.testing.assert_close(frame.camera.camera_to_world, expected.camera_to_world, atol=1e-6, rtol=0)

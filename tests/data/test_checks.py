@@ -38,9 +38,10 @@ def changed(frames=None, **changes):
     return replace(SCENE, **changes)
 
 
-def moved(share):
-    """The training frames with their principal points moved by a share of the width."""
-    cameras = [replace(f.camera, cx=f.camera.cx + share * f.camera.width) for f in SCENE.train]
+def moved(share, down=0.0):
+    """The training frames with their principal points moved by shares of the width and the height."""
+    cameras = [f.camera for f in SCENE.train]
+    cameras = [replace(c, cx=c.cx + share * c.width, cy=c.cy + down * c.height) for c in cameras]
     return tuple(replace(f, camera=camera) for f, camera in zip(SCENE.train, cameras))
 
 
@@ -126,6 +127,8 @@ def test_a_film_says_how_fast_its_camera_goes_around_its_subject():
             changed(train=moved(0.2)),
             "at 70% of .* the middle of images of .* columns were cut off, subtr",
         ),
+        (changed(train=moved(0.12, 0.1)), "at 62% of .* if they are resized copies, multiply fl_x, fl_y, cx"),
+        (changed(train=moved(-0.49, -0.51)), "as if cx and cy were written from the middle; add half of"),
         (changed(train=masked(1)), "masks hide nothing in all 8 of the training images looked at"),
         (changed(train=named(["0", "1", "10", "11", "2", "3", "4", "5"])), "texts.*10 comes where 2 is due"),
         (changed(still=torch.full((4, 3), 500.0)), "cameras see 0% of the 4 points that never move"),

@@ -17,7 +17,7 @@ from forewarp.data.files import Entry, layout_of
 from forewarp.data.module import DNeRFDataModule
 from forewarp.data.transforms import camera_of, check_times, left_aside, pose_in, times_of, with_intrinsics
 from forewarp.scene.camera import Camera
-from tests.support.written_scenes import around, dnerf_shots, edit, refused, write_dnerf
+from tests.support.written_scenes import around, dnerf_shots, edit, refused, write_dnerf, write_video
 
 EYE = torch.eye(4, dtype=torch.float64)
 WIDE = 2 * math.atan(0.5)  # of images as wide as their focal length
@@ -91,6 +91,16 @@ def test_an_angle_of_upright_images_is_of_the_width_or_as_told():
         ({"fl_x": 300, "cx": 160, "cy": 120}, r"cx: expected a principal point inside .*larger images"),
         ({"fl_x": 80, "is_fisheye": True}, "is_fisheye: expected a pinhole camera"),
         ({"fl_x": 160, "cx": 80, "cy": 60, "w": 80, "h": 60}, r"cx: expected .* images 2 times as large"),
+        ({"fl_x": 107, "cx": 53.3, "cy": 40}, "cx: expected w and h .* if resized, multiply .* by 0.7505"),
+        ({"fl_x": 60, "cx": 30, "cy": 22.5}, "cx: expected w and h .* if resized, multiply .* by 1.333"),
+        (
+            {"common": {"cameras": {"0": {"fl_x": 80}}}},
+            "got cameras, which is not read; write fl_x, fl_y, cx",
+        ),
+        (
+            {"common": {"cameras": [{"K": TRANSPOSED}]}},
+            "got cameras, which is not read; write fl_x, fl_y, cx",
+        ),
         ({"fl_x": 80, "k5": 0.1}, "k5: expected 0, but got 0.1; undistort"),
         ({"fl_x": 80, "distortion_params": [0.1, 0, 0, 0, 0, 0]}, "params: expected a lens as k1 k2"),
         ({}, "expected fl_x or camera_angle_x, but got neither"),
@@ -449,3 +459,21 @@ def test_what_other_programs_leave_names_the_way(tmp_path, file, said):
 def test_poses_written_in_another_way_are_refused_with_the_mend(matrix, said):
     with refused(f"transform_matrix: expected 4 x 4 or 3 x 4 finite numbers, but got .*; {said}"):
         pose_in(Entry("t.json", {"transform_matrix": matrix}), None, False)
+
+
+@pytest.mark.parametrize(
+    ("keys", "said"),
+    [
+        ({"cameras": {"0": {"fl_x": 80}}}, "cameras: not read, which seems to be of each camera; write fl_x"),
+        ({"sensors": [{"id": 0, "focal_length": 80}]}, "sensors: not read, which seems to be of each camera"),
+        ({"white_transparent": True}, "white_transparent: not read: images show their background; cut the"),
+        ({"white_transparent": False, "cameras": [{"id": 0, "place": [0, 0, 0]}]}, None),
+    ],
+)
+def test_keys_of_cameras_and_of_backgrounds_that_are_not_read_are_named(tmp_path, keys, said):
+    edit(write_video(tmp_path / "toy") / posed_video.FILE, keys)
+    lines = [
+        line for line in posed_video.read_scene(tmp_path, "toy").protocol["assumed"] if "not read" in line
+    ]
+    assert len(lines) == (said is not None)
+    assert (said or "") in "".join(lines)

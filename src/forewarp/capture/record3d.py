@@ -2,8 +2,9 @@
 
 An ``.r3d`` is a ZIP archive. ``metadata`` is JSON: ``w h`` and ``dw dh`` are the sizes of images and depths;
 ``poses`` has of each frame the quaternion x, y, z, w of a camera-to-world rotation with OpenGL's axes, and
-the camera's place in metres; ``K`` is the camera matrix, column by column; ``perFrameIntrinsicCoeffs``, where
-it is there, is fx, fy, cx, cy of each frame; ``frameTimestamps`` are seconds, or ``fps`` frames a second.
+the camera's place in metres; ``K`` is the camera matrix, column by column (row by row is told from that);
+``perFrameIntrinsicCoeffs``, where it is there, is fx, fy, cx, cy of each frame; ``frameTimestamps`` are
+seconds, or ``fps`` frames a second.
 ``rgbd/<i>.jpg`` is an image, ``rgbd/<i>.depth`` float32 metres along the optical axis and ``rgbd/<i>.conf`` a
 byte for each, ARKit's level 0, 1 or 2; both are compressed by LZFSE.
 """
@@ -12,7 +13,8 @@ from __future__ import annotations
 
 import json
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from reprlib import repr as short
 
@@ -20,6 +22,9 @@ import numpy as np
 import torch
 
 from forewarp.capture.frames import Step, write_smaller
+from forewarp.data.agreement import likeliest_reading, small_image
+from forewarp.data.cameras import check_camera
+from forewarp.data.depth import SHOWN, along_rays
 from forewarp.data.directions import opposite
 from forewarp.data.files import Entry, mismatch
 from forewarp.data.images import by, read_image
@@ -35,6 +40,7 @@ _SECONDS = 0.0, 1e11  # since the phone began or 1970
 _METADATA = 1 << 24  # bytes: parsed they take thirty times as many; of a frame about 150
 _ROOM = 1 << 26  # bytes that unpacking a plane may take beside what it holds
 _OVERHEAD = 4096  # bytes, at most, that compressed data are larger by: LZFSE stores blocks that do not shrink
+_GROUPS, _BESIDE = 3, (0, 6, 20)  # views that tell the order of quaternions, with others so many later
 _SAMPLED, _SMALLER = 16, 2  # depths that tell near and far; how many times smaller the copies are
 _ENDS = ((0.001, 0.75), (0.999, 1.25))  # of near and far: quantile of all depths, and room beside it
 
@@ -67,13 +73,12 @@ def capture_record3d(scan: Path, out: Path, step: Step, mark: str, frames: int |
         near, far = (float(np.quantile(there, share)) * room for share, room in _ENDS)
         first, last = (read.times[chosen[k]] for k in (0, -1))
         with folder_written_whole(out, mark) as folder, step("frames") as progress:
+            read.settle_order(chosen, folder)
 
             def shots() -> Iterator[PosedShot]:
                 for done, i in enumerate(chosen, 1):
                     name = f"{i:06d}.jpg"
-                    (folder / "images").mkdir(exist_ok=True)
-                    (folder / "images" / name).write_bytes(read.member(f"rgbd/{i}.jpg"))
-                    pixels = read_image(folder / "images" / name, read.size)[..., :3].numpy()
+                    pixels = read.image(i, folder)[..., :3].numpy()
                     write_smaller(folder, name, pixels, _SMALLER)
                     time, evidence = (read.times[i] - first) / ((last - first) or 1.0), read.confidence(i)
                     camera = read.camera(i)
@@ -83,7 +88,7 @@ def capture_record3d(scan: Path, out: Path, step: Step, mark: str, frames: int |
             write_scene(folder, shots(), near=near, far=far, seconds=last - first)
             facts = {"source": str(scan), "pictures": len(chosen), "found": len(read.poses)}
             facts |= {"size": list(read.size), "depth": list(read.of_depth), "seconds": last - first}
-            facts |= {"near": near, "far": far}
+            facts |= {"near": near, "far": far, "w_first": read.w_first}
             write_json(folder / mark, facts)
     return facts
 
@@ -91,9 +96,10 @@ def capture_record3d(scan: Path, out: Path, step: Step, mark: str, frames: int |
 def summary(facts: dict) -> list[str]:
     """Say what was found in a few lines."""
     size, of_depth, near, far = by(facts["size"]), by(facts["depth"]), facts["near"], facts["far"]
+    order = "; quaternions are w, x, y, z, as neighbouring views agree so" if facts["w_first"] else ""
     return [
         f"frames: {facts['pictures']} of {facts['found']}, {size} pixels, {facts['seconds']:.1f} s",
-        f"depth: {of_depth}, near {near:.2f} and far {far:.2f} metres; poses are the phone's",
+        f"depth: {of_depth}, near {near:.2f} and far {far:.2f} metres; poses are the phone's{order}",
     ]
 
 
@@ -113,9 +119,14 @@ class _Scan:
         self.size = width, height
         width, height = (int(self.about.number(key, 1, _MOST_DEPTH_SIDE)) for key in ("dw", "dh"))
         self.of_depth = width, height
-        self.poses = self._rows("poses", 7)
+        if abs(height * self.size[0] - width * self.size[1]) > max(width, height, *self.size):
+            expected = f"the proportions of w and h, {by(self.size)}"
+            advice = "exchange dw and dh, if depths are as upright as images"
+            raise mismatch(self.about.where("dw, dh"), expected, by(self.of_depth), advice)
+        self.poses, self.w_first = self._rows("poses", 7), False
         count, matrix = len(self.poses), self.about.numbers("K", 9, *_UNITS)
-        self.intrinsics = [[matrix[k] for k in (0, 4, 6, 7)]] * count
+        by_rows = matrix[6] == matrix[7] == 0 < min(matrix[2], matrix[5])
+        self.intrinsics = [[matrix[k] for k in ((0, 4, 2, 5) if by_rows else (0, 4, 6, 7))]] * count
         if about.get("perFrameIntrinsicCoeffs"):
             self.intrinsics = self._rows("perFrameIntrinsicCoeffs", 4, count)
         if about.get("frameTimestamps"):
@@ -130,10 +141,13 @@ class _Scan:
             fps = self.about.number("fps", 1e-3, _MOST_SIDE)
             self.times = [i / fps for i in range(count)]
 
-    def camera(self, i: int) -> Camera:
+    def camera(self, i: int, *, w_first: bool = False) -> Camera:
         """Return the camera of a frame; its near and far are not known."""
-        (x, y, z, w, *place), pose = self.poses[i], torch.eye(4, dtype=torch.float64)
-        q = torch.tensor([w, x, y, z], dtype=torch.float64)
+        (*q, x, y, z), pose = self.poses[i], torch.eye(4, dtype=torch.float64)
+        place, q = (
+            [x, y, z],
+            torch.tensor(q if w_first or self.w_first else [q[3], *q[:3]], dtype=torch.float64),
+        )
         if not 0.9 < float(q.norm()) < 1.1:
             where = f"{self.path}: metadata: poses[{i}]"
             raise mismatch(where, "a quaternion of length 1", f"{float(q.norm()):g}")
@@ -142,7 +156,34 @@ class _Scan:
         fx, fy, cx, cy = self.intrinsics[i]
         if min(fx, fy) <= 0:
             raise mismatch(f"{self.path}: metadata: focal length of frame {i}", "above 0", f"{min(fx, fy):g}")
-        return Camera(*self.size, fx, fy, cx, cy, opposite(pose[None])[0], 0.0, 1.0)
+        camera = Camera(*self.size, fx, fy, cx, cy, opposite(pose[None])[0], 0.0, 1.0)
+        check_camera(camera, f"{self.path}: metadata: principal point of frame {i}", "")
+        return camera
+
+    def settle_order(self, chosen: Sequence[int], folder: Path) -> None:
+        """Set ``w_first`` where neighbouring views of those ``chosen`` agree only if quaternions are w, x, y,
+        z; ``folder`` is the scene's.
+        """
+        groups, turned = [], {}
+        for k in spread(len(chosen), _GROUPS):
+            group = []
+            for i in [chosen[k + n] for n in _BESIDE if k + n < len(chosen)]:
+                image = small_image(self.image(i, folder), SHOWN)
+                camera = self.camera(i).resized(image.shape[1], image.shape[0])
+                pose = self.camera(i, w_first=True).camera_to_world
+                turned[id(camera)] = replace(camera, camera_to_world=pose)
+                depth = torch.from_numpy(self.depth(i).copy())
+                group.append((camera, image, along_rays(depth[None], camera)[0]))
+            groups.append(group)
+        reading = {"w_first": lambda camera, away: (turned[id(camera)], away)}
+        self.w_first = likeliest_reading(groups, reading) is not None
+
+    def image(self, i: int, folder: Path) -> torch.Tensor:
+        """Write the image of a frame into a scene's folder as it is, and decode it: uint8 (H, W, 4)."""
+        path = folder / "images" / f"{i:06d}.jpg"
+        path.parent.mkdir(exist_ok=True)
+        path.write_bytes(self.member(f"rgbd/{i}.jpg"))
+        return read_image(path, self.size)
 
     def depth(self, i: int) -> np.ndarray:
         """Return metres (H, W) float32 along the optical axis, 0 where there is none."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from itertools import permutations
 from statistics import median
 
@@ -87,7 +87,7 @@ def leaning(
         about 0 where the first is right and 1 where the second is, and the share by which distances of each
         differ, medians of all pairs; None where no two views show enough of the same in which both differ.
     """
-    clouds = [_points(camera, both)[1] for camera, *both in zip(cameras, *readings)]
+    clouds = [_points([(camera, one) for one in both])[1] for camera, *both in zip(cameras, *readings)]
     pairs = [(clouds[k], view) for k, view in permutations(range(len(cameras)), 2)]
     pairs += [] if known is None else [([known, known], view) for view in range(len(cameras))]
     found = [_lean(cameras[view], [given[view] for given in readings], both) for both, view in pairs]
@@ -140,15 +140,18 @@ def small_image(pixels: Tensor, side: int = SIDE) -> Tensor:
     return interpolate(planes, (height, width), mode="area")[0].permute(1, 2, 0)
 
 
-def _points(camera: Camera, readings: Sequence[Tensor]) -> tuple[Tensor, list[Tensor]]:
+def _points(readings: Sequence[tuple[Camera, Tensor]]) -> tuple[Tensor, list[Tensor]]:
     """Return some pixels (P,) of a view that have distances (H, W) along their rays in all readings, and the
     points (P, 3) float64 that they show in each.
     """
-    there = torch.stack([distances > 0 for distances in readings]).all(0).flatten().nonzero()[:, 0]
+    there = torch.stack([distances > 0 for _, distances in readings]).all(0).flatten().nonzero()[:, 0]
     there = there[:: max(1, len(there) // _SAMPLES)]
-    rays = camera.rays(there, torch.float64)
-    away = [distances.flatten()[there].double()[:, None] for distances in readings]
-    return there, [rays.origins + n * rays.directions for n in away]
+    rays = {id(camera): camera.rays(there, torch.float64) for camera, _ in readings}
+    points = []
+    for camera, distances in readings:
+        origins, directions = rays[id(camera)].origins, rays[id(camera)].directions
+        points.append(origins + distances.flatten()[there].double()[:, None] * directions)
+    return there, points
 
 
 def _seen(camera: Camera, points: Tensor) -> tuple[Tensor, Tensor]:
@@ -158,30 +161,51 @@ def _seen(camera: Camera, points: Tensor) -> tuple[Tensor, Tensor]:
     return pixel, (z > 0) & (pixel >= 0).all(-1) & (pixel < size).all(-1)
 
 
+def likeliest_reading(
+    groups: Sequence[Sequence[tuple[Camera, Tensor, Tensor]]],
+    readings: Mapping[str, Callable[[Camera, Tensor], tuple[Camera, Tensor]]],
+) -> str | None:
+    """Name the reading of cameras and distances by which colours of views agree much better than as read.
+
+    Args:
+        groups: of views that are compared: each a camera, its image (H, W, 3) in [0, 1], and distances
+            (H, W) along the rays, 0 where there is none, as read.
+        readings: other cameras and distances of a view, by name.
+    """
+    each = [lambda *given: given, *readings.values()]
+    errors: list[list[float]] = [[] for _ in each]
+    for group in groups:
+        views = [[read(camera, away) for camera, _, away in group] for read in each]
+        for before, more in zip(errors, warp_errors([image for _, image, _ in group], views)):
+            before.extend(more)
+    return likeliest(errors[0], dict(zip(readings, errors[1:])))
+
+
 def warp_errors(
-    cameras: Sequence[Camera], images: Sequence[Tensor], readings: Sequence[Sequence[Tensor]]
+    images: Sequence[Tensor], readings: Sequence[Sequence[tuple[Camera, Tensor]]]
 ) -> list[list[float]]:
     """Return how far colours differ where distances put pixels of one view into another.
 
     Args:
-        cameras: at the size of the images.
         images: (H, W, 3) in [0, 1].
-        readings: each of (H, W) along the rays of each view, 0 where there is none.
+        readings: each of the camera of each view, of the image's size, and (H, W) along its rays, 0 where
+            there is none.
 
     Returns:
         of each reading for each pair a mean in [0, 1], of pixels that have a distance in all readings;
         infinite where the one shows next to nothing of the other.
     """
-    clouds = [_points(camera, distances) for camera, *distances in zip(cameras, *readings)]
+    clouds = [_points(views) for views in zip(*readings)]
     errors = [[] for _ in readings]
-    for k, view in permutations(range(len(cameras)), 2):
+    for k, view in permutations(range(len(images)), 2):
         there, points = clouds[k]
         for n, of_reading in enumerate(errors):
-            pixel, inside = _seen(cameras[view], points[n])
+            camera = readings[n][view][0]
+            pixel, inside = _seen(camera, points[n])
             if int(inside.sum()) < _LEAST_PIXELS:
                 of_reading.append(torch.inf)
                 continue
-            grid = 2 * pixel[inside] / pixel.new_tensor([cameras[view].width, cameras[view].height]) - 1
+            grid = 2 * pixel[inside] / pixel.new_tensor([camera.width, camera.height]) - 1
             shown = images[view].double().permute(2, 0, 1)[None]
             options = {"align_corners": False, "padding_mode": "border"}
             shown = grid_sample(shown, grid[None, None], **options)[0, :, 0].T
@@ -213,7 +237,7 @@ def plane_error(cameras: Sequence[Camera], distances: Sequence[Tensor]) -> float
     """Return by which share, at most, distances (H, W) along the rays of two views differ where both have
     one, 0 where there is none; None where no two do.
     """
-    clouds, errors = [_points(camera, [away])[1][0] for camera, away in zip(cameras, distances)], []
+    clouds, errors = [_points([view])[1][0] for view in zip(cameras, distances)], []
     for k, view in permutations(range(len(cameras)), 2):
         pixel, inside = _seen(cameras[view], clouds[k])
         column, row = pixel[inside].long().unbind(-1)

@@ -24,6 +24,7 @@ FLIP = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenGL's axes of a camera to OpenCV's,
 MOST_UNITS = 1e9  # largest coordinate: farther from the origin single precision is long lost
 _LARGER, _SAME_FACTOR = 1.5, 0.1  # of a middle beyond the image's own, which tells a larger image's
 _LEAST_FACTOR, _EXCHANGED = 0.1, 0.05  # of a smaller image's middle; by which exchanged sides may be off
+_SHARES = 0.2  # of the sides, below which no principal point lies
 _FEW_PIXELS = 8  # of a side, which is no image
 WIDEST = 110  # degrees of a pinhole camera, of which phones' widest have 108
 IN_PIXELS = "if fl_x is in millimetres, multiply it by w and divide it by the sensor's width"
@@ -140,7 +141,8 @@ def check_camera(camera: Camera, middle: str, lens: str) -> None:
     exchanged = 2 * camera.cx / camera.height, 2 * camera.cy / camera.width
     aside, advice = min(abs(across - 1), abs(down - 1)), None
     factor = math.sqrt(across * down) if of_one_factor else 1.0
-    if 0 < max(camera.cx, camera.cy) <= 1 < min(camera.width, camera.height) / _FEW_PIXELS:
+    shares = min(camera.cx, camera.cy) > _SHARES and max(camera.cx, camera.cy) <= 1
+    if shares and min(camera.width, camera.height) > _FEW_PIXELS:
         advice = "they are shares of the size: multiply cx and fl_x by the width, cy and fl_y by the height"
     elif not 1 / _LARGER < factor < _LARGER:
         size, way = (factor, "down") if factor > 1 else (1 / factor, "up")

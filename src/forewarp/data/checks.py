@@ -24,7 +24,8 @@ _WITHIN = 5  # points along a side of the box that cameras are asked for
 _FAINT = 8  # of 255: alpha that is nowhere above it was written as 0 and 1
 _ZOOMED = 1.25  # focal lengths of test and training images
 _ASIDE = 0.25  # share of a side by which a principal point is far from the middle
-_CROPPED, _MIDDLE = 0.08, 0.01  # shares by which one of a crop is off, and the other at most
+_CROPPED, _MIDDLE = 0.08, 0.01  # shares by which one of a crop is off; and the other, of one side alone
+_CORNER = 0.05  # shares of the sides from the corner, which are rather from the middle
 _STRETCHED, _SAME_PLACE = 1.25, 1e-9  # sides of a pixel; share of the cameras' distance from the origin
 _AROUND = 2  # half a side of a subject's box in distances of the farthest camera from what they look at
 _WALKED, _SLOW = 5, 1  # degrees around what a film shows, in all and a second, that are too few
@@ -119,7 +120,10 @@ def _pinholes(scene: Scene) -> Iterator[str]:
     down = float(torch.tensor([camera.cy / camera.height for camera in cameras]).median())
     if max(abs(across - 0.5), abs(down - 0.5)) > _ASIDE:
         line = f"the principal point lies at {across:.0%} of the width and {down:.0%} of the height"
-        yield f"{line}, as of images that were cropped since; subtract what was cut off from cx and cy"
+        advice = "as of images that were cropped since; subtract what was cut off from cx and cy"
+        if max(abs(across), abs(down)) < _CORNER:
+            advice = "as if cx and cy were written from the middle; add half of the width and of the height"
+        yield f"{line}, {advice}"
     elif line := _of_other_shape(cameras[0].width, cameras[0].height, across, down):
         yield line
     stretched = [frame.camera.fy / frame.camera.fx for frame in scene.train]
@@ -131,16 +135,19 @@ def _pinholes(scene: Scene) -> Iterator[str]:
 
 
 def _of_other_shape(width: int, height: int, across: float, down: float) -> str | None:
-    """Say that a principal point, in shares of the sides, is the middle of images of another shape: in the
-    middle of one side and aside on the other, as of images that were cropped.
+    """Say that a principal point, in shares of the sides, is the middle of images of another shape, aside on
+    one side or both, as of images that were cropped.
     """
     off = abs(across - 0.5), abs(down - 0.5)
-    if max(off) <= _CROPPED or min(off) > _MIDDLE:
+    if max(off) <= _CROPPED:
         return None
     sides = round(2 * across * width), round(2 * down * height)
     key, cut = ("cy", sides[1] - height) if off[1] > off[0] else ("cx", sides[0] - width)
     at = f"the principal point lies at {across:.0%} of the width and {down:.0%} of the height"
     line = f"{at}: the middle of images of {by(sides)} pixels, where these have {by((width, height))}"
+    if min(off) > _MIDDLE:
+        advice = "if these were cropped, subtract from cx and cy the columns and rows before the image"
+        return f"{line}; {advice}, if they are resized copies, multiply fl_x, fl_y, cx and cy, too"
     what = "rows" if key == "cy" else "columns"
     advice = f"if {what} were added before the image, add them to {key}"
     if cut > 0:

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from forewarp.data.agreement import leaning, likeliest, plane_error, small_image, warp_errors
+from forewarp.data.agreement import leaning, likeliest_reading, plane_error, small_image
 from forewarp.data.arrays import check_shape, load_numpy
 from forewarp.data.files import existing, mismatch
 from forewarp.data.images import CACHE, by, read_gray16, read_image
@@ -39,16 +39,17 @@ _COMPARED, _BESIDE = (
     3,
     ((0, 0), (24, 2), (8, 6)),
 )  # views whose colours are compared, with others: share, least
-_SIDE = 128  # pixels of these
+SHOWN = 128  # pixels of the longer side of these
 _UNITS = (1.0, MILLIMETRES, 1e-2, 1e2, 1e3, 2e-4, 1 / 256, 0.0254, 0.3048)  # that depth is written in
 _SAME_UNIT = 0.03
 _DOUBTED = 0.5  # confidence above which some depths are
 _TRUSTED = 8  # files that tell whether confidences are levels, and of which the largest depths are looked at
 _TURNED = {  # what else may be in files of depth
-    "upside down": lambda away: away.flip(0),
-    "mirrored": lambda away: away.flip(1),
-    "turned by half": lambda away: away.flip(0, 1),
+    "upside down": lambda camera, away: (camera, away.flip(0)),
+    "mirrored": lambda camera, away: (camera, away.flip(1)),
+    "turned by half": lambda camera, away: (camera, away.flip(0, 1)),
 }
+_TURN = "turn them as their images are"
 _FACTORS = (0.5, 0.7, 1.4, 2.0)  # by which depths may be off, where near and far allow it
 
 
@@ -115,13 +116,9 @@ class SensedDepth:
 
     def _placed(self, depth: np.ndarray, trust: np.ndarray) -> Tensor:
         """Make planes of the camera's size of depths and confidences of the file's."""
-        size = self.camera.height, self.camera.width
         depth[depth * self.scale > np.finfo(np.float32).max] = 0
         planes = torch.from_numpy(np.stack([depth * self.scale, trust * (depth > 0)]).astype(np.float32))
-        planes = torch.nn.functional.interpolate(planes[None], size, mode="nearest-exact")[0]
-        if self.kind != "ray":
-            planes[0] /= _cosines(*self.camera.inner)
-        return planes
+        return along_rays(planes, self.camera, self.kind)
 
     def at_known(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return those of ``values`` (H', W') where the camera sees ``known`` points, and the depths of these
@@ -378,26 +375,23 @@ def _doubt_colors(
         groups = [[frames[i + n] for n in beside if i + n < len(frames)] for i in firsts]
     views = {}
     for frame in {id(frame): frame for group in groups for frame in group}.values():
-        image = small_image(frame.load(), _SIDE)
+        image = small_image(frame.load(), SHOWN)
         camera = frame.camera.resized(image.shape[1], image.shape[0])
-        away = replace(frame.load_sensed, camera=camera, confidence=None)._decode()[0]
-        views[id(frame)] = camera, image, away
-    readings, scale = {"": (lambda away: away, "")}, frames[0].load_sensed.scale / world
-    for how, turned in _TURNED.items():
-        readings[f"are {how}"] = turned, "turn them as their images are"
+        views[id(frame)] = (
+            camera,
+            image,
+            replace(frame.load_sensed, camera=camera, confidence=None)._decode()[0],
+        )
+    readings = {f"depths are {how}": (turned, _TURN) for how, turned in _TURNED.items()}
     for factor in _FACTORS:
-        advice = unit.format(f"{factor * scale:.2g}")
-        readings[f"are about {factor:g} times as far"] = (lambda away, by=factor: by * away), advice
-    errors: list[list[float]] = [[] for _ in readings]
-    for group in groups:
-        cameras, images, away = zip(*(views[id(frame)] for frame in group))
-        found = warp_errors(cameras, images, [[*map(read, away)] for read, _ in readings.values()])
-        errors = [before + more for before, more in zip(errors, found)]
-    how = likeliest(errors[0], dict(zip(readings, errors)))
+        scaled = lambda camera, away, by=factor: (camera, by * away)  # noqa: E731
+        advice = unit.format(f"{factor * frames[0].load_sensed.scale / world:.2g}")
+        readings[f"depths are about {factor:g} times as far"] = scaled, advice
+    views = [[views[id(frame)] for frame in group] for group in groups]
+    how = likeliest_reading(views, {how: read for how, (read, _) in readings.items()})
     if how is None:
         return []
-    line = f"colours of neighbouring views agree much better if depths {how}"
-    return [f"{where}: {line}; {readings[how][1]}"]
+    return [f"{where}: colours of neighbouring views agree much better if {how}; {readings[how][1]}"]
 
 
 def _near_pairs(frames: Sequence[Frame]) -> list[list[Frame]]:
@@ -604,6 +598,17 @@ def _read_confidence(path: Path, levels: bool | None) -> np.ndarray:
         advice = "write them alike in all files" if values.dtype.kind != "f" else ""
         raise mismatch(path, expected, got, advice)
     return np.asarray(values, np.float64) / most
+
+
+def along_rays(planes: Tensor, camera: Camera, kind: str = "axis") -> Tensor:
+    """Bring planes (C, H', W'), the first of a depth, to a camera's size, each pixel the nearest: (C, H, W);
+    depth of a ``kind`` other than ``ray`` becomes the distance along the pixels' rays.
+    """
+    size = camera.height, camera.width
+    planes = torch.nn.functional.interpolate(planes[None], size, mode="nearest-exact")[0]
+    if kind != "ray":
+        planes[0] /= _cosines(*camera.inner)
+    return planes
 
 
 @lru_cache(maxsize=8)

@@ -58,8 +58,13 @@ _READ = {*_PATHS, "depth_scale", *_LENS, *_UNREAD_LENSES}  # or told elsewhere
 _INNER = ("cam_K", "K", "intrinsics", "intrinsic", "intrinsic_matrix", "camera_intrinsics", "camera_matrix")
 _LIKE_ANGLE = re.compile("(?i)([hvxy]_?)?(fov|field_of_view)(_?([hvxy]|deg|degrees|rad|vert.*|hor.*))?")
 _LIKE_FOCAL = re.compile("(?i)fx|f|focal(_?len(gth)?)?(_?x)?|flx")
+_HAS_FOCAL = re.compile(
+    "(?i)fl_?x|fx|focal(_?length)?(_?[xy])?|camera_angle_[xy]|k|cam_k|intrinsics?|(camera|intrinsic)_matrix"
+)
+_CUT_OUT = re.compile("(?i)(white|black)_?(is_?)?(transparent|bkgd|background)")  # of images without alpha
 _FOCAL = ("fl_x", "fl_y", "camera_angle_x")
 _SAME_FOCAL = 0.02  # share by which two focal lengths of one camera may differ
+_RESIZED = 0.1  # by which more or less than half of both sides it is another image's, unless w and h say not
 _OUTSIDE = 0.9  # share of a side beyond which a principal point is another image's
 _TIMES = ("timestamp", "time_stamp", "frame_time", "time_id", "t", "frame_id", "frame")  # of programs
 _MOST_TIME = 1e20
@@ -166,11 +171,29 @@ def unread_beside(
         return any(each not in (None, False, 0, "") for each in values)
 
     like = [key for key in like if any(is_said(entry.get(key)) for entry in entries)]
+    if key := _cameras_elsewhere(content):
+        advice = "write fl_x, fl_y, cx, cy and the lens of its camera into each frame"
+        lines.append(f"{file}: {key}: not read, which seems to be of each camera; {advice}")
+    cut = [key for key in keys if _CUT_OUT.fullmatch(key) and any(is_said(e.get(key)) for e in entries)]
+    if cut:
+        advice = "cut the subject out by alpha, or name masks by mask_path and set data.masks=alpha"
+        lines.append(f"{file}: {cut[0]}: not read: images show their background; {advice}")
     if not like:
         return lines
     advice = "masks are read from mask_path, depth from depth_file_path, a lens from k1 k2 k3 p1 p2 and cx cy"
     said = f"{', '.join(like[:4])}: not read, which seem to be masks, depth or a lens"
     return [f"{file}: {said}; {advice}", *lines]
+
+
+def _cameras_elsewhere(content: Mapping) -> str | None:
+    """Find the key that holds objects with a focal length, as of cameras that frames name; None without."""
+    for key, value in content.items():
+        inner = [value, *value.values()] if isinstance(value, dict) else value
+        is_list = isinstance(inner, list) and key != "frames"
+        for each in inner if is_list else ():
+            if isinstance(each, dict) and any(_HAS_FOCAL.fullmatch(str(name)) for name in each):
+                return key
+    return None
 
 
 def image_of(entry: Entry, key: str, scale: int = 1) -> Path:
@@ -226,6 +249,15 @@ def camera_of(
         got = f"({cx:g}, {cy:g}) of images of {by(stored)} pixels"
         advice = "they are of larger images: divide fl_x, fl_y, cx and cy by how many times these are smaller"
         raise mismatch(entry.where("cx"), "a principal point inside the image", got, advice)
+    across, down = 2 * cx / width, 2 * cy / height
+    of_one_factor = down > 0 and abs(across / down - 1) < _SAME_FOCAL and abs(across - 1) > _RESIZED
+    if entry.get("w") is None and entry.get("h") is None and of_one_factor:
+        expected = "w and h beside a principal point that is not in the middle"
+        got = f"none, and ({cx:g}, {cy:g}) of images of {by(stored)} pixels"
+        advice = (
+            "write w and h of these images if they were cropped; if resized, multiply fl_x, fl_y, cx and cy"
+        )
+        raise mismatch(entry.where("cx"), expected, got, f"{advice} by {1 / across:.4g}")
     k = tuple(entry.number(key, -1e6, 1e6, 0.0) for key in ("k1", "k2", "k3"))
     p = tuple(entry.number(key, -1e6, 1e6, 0.0) for key in ("p1", "p2"))
     for key in ("k4", "k5", "k6"):
@@ -307,6 +339,9 @@ def _no_focal(entry: Entry) -> SceneError:
             return mismatch(where, expected, f"{key} {short(value)}", advice)
         if _LIKE_FOCAL.fullmatch(key):
             return mismatch(where, expected, f"{key} {short(value)}", "call it fl_x, in pixels")
+    if key := _cameras_elsewhere(entry.common):
+        advice = "write fl_x, fl_y, cx, cy and the lens of its camera into each frame"
+        return mismatch(entry.where("fl_x"), "fl_x or camera_angle_x", f"{key}, which is not read", advice)
     return mismatch(entry.where("fl_x"), "fl_x or camera_angle_x", "neither")
 
 
