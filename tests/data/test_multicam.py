@@ -328,9 +328,11 @@ def test_films_of_other_names_are_said_or_refused(folder):
     assert line.endswith("toy: left not read, as names of cameras begin with cam")
 
 
-def test_frames_counted_in_hexadecimal_are_refused(folder):
+def test_frames_counted_in_hexadecimal_need_a_pattern(folder):
     for camera in folder.glob("cam*"):
         for n, path in enumerate(sorted(camera.iterdir())):
             path.rename(camera / f"{n + 7:04x}.png")
-    with refused("cam00: expected names that tell the order, but got hexadecimal ones, as 000a"):
+    with refused("cam00: .* names as '000a': .* hexadecimal numbers; .*data.name_pattern"):
         read_scene(folder.parent, "toy")
+    scene = read_scene(folder.parent, "toy", name_pattern="(?P<frame>[0-9a-f]+)")
+    assert scene.times == pytest.approx(np.linspace(0, 1, len(scene.times)))

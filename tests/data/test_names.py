@@ -1,5 +1,7 @@
 """Names of images, as cameras, phones, rigs and programs write them."""
 
+from datetime import datetime, timedelta
+
 import numpy as np
 import pytest
 
@@ -54,6 +56,93 @@ def in_groups(form: str, firsts, lasts) -> list[str]:
 def test_numbers_that_names_say_in_one_way(names, frames):
     found = np.array(read_names(names, "t.json").frames)
     assert found - found.min() == pytest.approx(frames, abs=1e-5)
+
+
+def at(step: float, count: int, form: str, first: str = "2023-11-04T23:58:50.1") -> list[str]:
+    """Name images taken every ``step`` seconds; ``$`` in the form are thousandths."""
+    days = [datetime.fromisoformat(first) + timedelta(seconds=step * i) for i in range(count)]
+    return [day.strftime(form.replace("$", f"{day.microsecond // 1000:03d}")) for day in days]
+
+
+def code(frame: int, rate: int, dropped: int = 0) -> str:
+    """Write a time code, without the first ``dropped`` numbers of all minutes but each tenth."""
+    tens, rest = divmod(frame, 600 * rate - 9 * dropped)
+    frame += 9 * dropped * tens + dropped * max(0, (rest - dropped) // (60 * rate - dropped))
+    seconds = frame // rate
+    return f"{seconds // 3600:02d}{seconds // 60 % 60:02d}{seconds % 60:02d}{frame % rate:02d}"
+
+
+EVEN_SCHEMES = {
+    "as few decimals as needed": [f"img_{0.04 * i:g}" for i in range(60)],
+    "decimals of a program": [f"img_{round(i / 30, 3)}" for i in range(40)],
+    "decimals and a counter": [f"{i:04d}_{i / 10:g}" for i in range(30)],
+    "a version behind decimals": [f"t{i / 30:.2f}_v2" for i in range(1, 40)],
+    "seconds and nanoseconds not filled": [f"{1699092672 + i // 4}_{i % 4 * 250000000}" for i in range(9)],
+    "the same behind a point": [f"{1699092672 + i // 3}.{i % 3 * 333333333}" for i in range(9)],
+    "nanoseconds": [str(1699092672123456789 + 33333333 * i) for i in range(9)],
+    "a phone": at(0.5, 60, "PXL_%Y%m%d_%H%M%S$"),
+    "behind a point": at(0.5, 60, "%Y%m%d_%H%M%S.$"),
+    "behind a line": at(0.033, 60, "IMG_%Y%m%d_%H%M%S_$"),
+    "one digit": at(0.2, 60, "%Y-%m-%dT%H-%M-%S.$Z"),
+    "millionths": at(0.07, 60, "%Y%m%dT%H%M%S%f"),
+    "a comma": at(0.07, 60, "%Y-%m-%d %H-%M-%S,$"),
+    "the day first": at(31, 60, "%d.%m.%Y %H.%M.%S"),
+    "the month first": at(31, 60, "%m-%d-%Y_%H-%M-%S"),
+    "days, the day first": at(86400, 40, "plant_%d%m%Y"),
+    "days, two digits of the year": at(86400, 40, "plant_%y%m%d"),
+    "two digits of the year": at(31, 60, "%y%m%d_%H%M%S"),
+    "twelve hours": at(31, 60, "%Y-%m-%d_%I-%M-%S-%p"),
+    "twelve hours without a date": at(31, 60, "%I-%M-%S %p", "2023-11-04T11:50:00"),
+    "packed time codes": [code(89950 + i, 25) for i in range(90)],
+    "packed time codes of film": [code(24 * 3599 + 5 * i, 24) for i in range(90)],
+    "folders of a camera": [f"{100 + i // 9999}ND750/DSC_{i % 9999 + 1:04d}" for i in range(9990, 10008)],
+    "a counter of six digits": [f"{i:06d}" for i in range(110000, 112000, 50)],
+    "digits of another script": [f"f{chr(0x661)}{chr(0x660 + i)}" for i in range(10)],
+    "sizes, rates and lenses": [f"50mm_f1.8_29.97fps_{i:04d}_1920x1080_v2" for i in range(12)],
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("scheme", EVEN_SCHEMES)
+@pytest.mark.parametrize("one_camera", [False, True])
+def test_schemes_of_practitioners_are_read_right(scheme, one_camera):
+    names = EVEN_SCHEMES[scheme]
+    order = np.random.default_rng(0).permutation(len(names))
+    found = read_names([names[i] for i in order], "t.json", one_camera=one_camera)
+    step = 1 / (len(names) - 1)
+    # Thousandths, and hundredths of a second, are rounded.
+    assert np.array(found.times) == pytest.approx(order * step, abs=0.26 * step)
+
+
+@pytest.mark.parametrize(
+    ("names", "times"),
+    [
+        (in_groups("GX{:02d}0034_{:04d}", (1, 2), range(1, 9)), range(16)),
+        ([f"take{t}_{i}" for t, n in ((1, 9), (2, 5)) for i in range(n)], range(14)),
+        ([code(i, 30, 2)[:2] + "-" + "-".join(code(i, 30, 2)[k : k + 2] for k in (2, 4, 6))
+          for i in range(1700, 1900)], range(200)),
+        ([f"1699092672_{i:02d}" for i in range(30)] + [f"1699092673_{i:02d}" for i in range(30)], range(60)),
+        ([f"{m}m{s:02d}s" for m in (1, 2) for s in range(0, 60, 2)], range(60)),
+    ],
+)  # fmt: skip
+def test_several_numbers_of_one_camera_order_one_film(names, times):
+    found = read_names(names, "p", one_camera=True).times
+    assert found == pytest.approx(np.array(times) / max(times), abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        in_groups("{}_{:04d}", ["rgb", "depth"], range(9)),
+        in_groups("frame_{1:04d}_cam{0:02d}", range(3), range(9)),
+        in_groups("{}_{:05d}", range(3), range(40)),
+        in_groups("day{:02d}_{:02d}", (1, 5), range(4)),  # how long between them?
+        [f"{s}_{f:02d}" for s, f in ((0, 3), (0, 20), (1, 17), (1, 22), (2, 13), (3, 1))],
+        [f"{day:02d}-{month:02d}" for month in (10, 11) for day in range(1, 30)],
+    ],
+)
+def test_numbers_that_order_no_film_of_one_camera_are_refused(names):
+    with refused("data.name_pattern"):
+        read_names(names, "p", one_camera=True)
 
 
 @pytest.mark.parametrize("form", ["{}_{:03d}", "s{}/{:03d}", "cam_{}_{:03d}", "{}-{:03d}"])
@@ -116,6 +205,13 @@ def test_cameras_beside_each_other_that_move_on_are_a_rig():
         ([f"{i:04X}" for i in range(158, 190)], "hexadecimal numbers"),
         ([f"cam{k}/{i:03x}_rgb" for k in range(2) for i in range(12)], "hexadecimal numbers"),
         (["cap_235000", "cap_235900", "cap_001000"], "times of day more than half a day apart"),
+        (["11-50-00 PM", "11-59-00 PM", "12-10-00 AM"], "times of day more than half a day apart"),
+        (["01.11.2023", "05.12.2023", "03.12.2023", "02.12.2023"], "begin with the day, or .* the month"),
+        (["x_101112", "x_101130", "x_101205", "x_101231"], "dates that begin with two .*, or times of day"),
+        (["a_1.3", "a_1.9", "a_1.11", "a_2.12"], "seconds with a fraction, or a counter"),
+        ([f"20231104_10111{s}_{f}" for s, f in ((2, 345), (3, 410), (4, 777))], "fractions of the seconds"),
+        ([f"010059{f:02d}" for f in (1, 7, 20)] + ["01010001", "01010019"], "codes of 24 frames a second"),
+        ([f"frame_{i:05d}" for i in (-50, -43, 6, 13)], "differs from image to image, as signs"),
         ([f"{c}_{i}" for c, n in ((1, 9), (2, 5)) for i in range(n)], "names that tell times in one way"),
     ],
 )  # fmt: skip

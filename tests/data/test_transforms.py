@@ -258,6 +258,9 @@ def test_times_that_miss_0_and_1_by_rounding_are_not_scaled():
         ([0, 0.5, 1], [0, 50, 100], r"times of train frames: expected one .* 0 to 100, .* 0 to 1 \(train/0"),
         ([0, 50, 100], [0, 0.5, 1], "times of test frames: expected one unit .* write all times in one unit"),
         ([i / 9 for i in range(10)], range(16), r"train frames: expected one unit .* 0 to 15, .* 0 to 1 \("),
+        ([0, 0.2, -1, 0.6, 0.8], [0.5, 1], "train/2: expected a time near all others, 0 to 1, .* -1;"),
+        ([*range(20), -99], [20], "time of train/20: expected a time near all others, 0 to 20, but got -99;"),
+        ([*(i / 20 for i in range(20)), 5], [1], "time of train/20: expected .* 0 to 1, but got 5;"),
     ],
 )
 def test_times_in_two_units_are_refused(train, test, said):
@@ -276,11 +279,31 @@ def test_times_in_two_units_are_refused(train, test, said):
         ([7, 7, 7], [0, 100]),
         ([0, 0.5, 1, 1.5, 3], [2]),
         ([0, 0.4, 0.8, 1], [1.1, 1.2]),  # seconds
+        ([i / 30 for i in range(32)], [32 / 30]),
+        (range(-1, 99), [50]),
     ],
 )
 def test_times_in_one_unit_are_not_refused(train, test):
     times = {"train": train, "test": test}
     check_times({k: {f"{k}/{i}": t for i, t in enumerate(of)} for k, of in times.items()}, "t.json")
+
+
+@pytest.mark.parametrize(
+    ("times", "said"),
+    [
+        ([*range(9), 0, *range(10, 20)], "time 0 of f/0009 is out of the order of the images' names; mend"),
+        ([*range(9), -1, *range(10, 20)], "time -1 of f/0009 is out of the order"),
+        ([0, 0.1, 0.2, 33.0, 0.4, 0.5, 0.6], "time 33 of f/0003 is out of the order"),
+        ([0.0] * 19 + [1.0], r"19 of 20 images have one time, 0 \(f/0000, f/0001, ..\); mend it"),
+        ([*range(9), 8, *range(10, 20)], r"2 of 20 images have one time, 8 \(f/0008, f/0009, ..\); mend it"),
+        ([*range(10), *range(10)], None),
+        ([i // 2 for i in range(20)], None),
+        ([*range(20)][::-1], None),
+    ],
+)
+def test_an_odd_time_among_those_of_a_film_is_said(times, said):
+    _, line = times_of([f"f/{i:04d}" for i in range(len(times))], times, "t.json")
+    assert re.search(said, line) if said else "mend it" not in (line or "")
 
 
 @pytest.mark.parametrize(

@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from torch.nn.functional import adaptive_max_pool2d, interpolate
 
-from forewarp.data.files import SUFFIXES, UNREAD, SceneError, composed, mismatch, way_from, way_from_file
+from forewarp.data.files import SUFFIXES, UNREAD, composed, mismatch, way_from, way_from_file
 from forewarp.data.images import bright, by, common_header, read_image, write_image
 from forewarp.data.names import in_order, read_names
 from forewarp.data.video import HDR, Log, decode, deinterlacing, extracted, hdr_of, hdr_unsaid
@@ -250,15 +250,9 @@ def _from_folder(folder: Path, source: Source, step: Step) -> dict:
         raise mismatch(source.images, "a folder of many pictures, PNG or JPEG", got, advice)
     rows = {path: row for row, path in enumerate(paths)}
     names = [path.relative_to(source.images).with_suffix("").as_posix() for path in paths]
-    where, read, numbers = source.images, None, rows
+    where, numbers = source.images, rows
     assumed = f"{where}: times are even, in the order of the images' names"
-    try:
-        read = read_names(names, str(where), source.name_pattern)
-    except SceneError as error:
-        if as_stored or source.name_pattern is not None:
-            raise
-        # Images of one camera have an order, whatever else their names may say.
-        assumed = f"{assumed}, so gaps are lost ({str(error).removeprefix(f'{where}: ')})"
+    read = read_names(names, str(where), source.name_pattern, one_camera=not as_stored)
     if read is not None and (as_stored or len({*read.frames}) == len(paths)):
         numbers, assumed = dict(zip(paths, read.times)), f"{where}: times: {read.told}"
         paths.sort(key=numbers.get)

@@ -168,7 +168,7 @@ def _recording(name: str, path: Path, rate: float | None, name_pattern: str | No
     images = ()
     if path.is_dir():
         images = tuple(images_in(path))
-        read = read_names([image.stem for image in images], str(path), name_pattern)
+        read = read_names([image.stem for image in images], str(path), name_pattern, one_camera=True)
         numbers = range(len(images)) if read is None else read.frames
         stamps = np.array(numbers, dtype=np.float64) / (rate or 1.0)
         order = np.argsort(stamps, kind="stable")

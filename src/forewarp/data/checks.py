@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 
 import torch
 from torch import Tensor
 
 from forewarp.data.cameras import IN_PIXELS, WIDEST, degrees_of, nine_pixels
 from forewarp.data.directions import common_point
-from forewarp.data.files import mismatch
+from forewarp.data.files import SceneError, mismatch
 from forewarp.data.images import by
-from forewarp.data.names import hexadecimal, in_order
+from forewarp.data.names import hexadecimal, in_order, read_names
 from forewarp.scene.box import Box, Lattice
 from forewarp.scene.camera import Camera, focus_point
 from forewarp.scene.frame import Frame, Scene, sightings, spread, walk_of, where_seen
@@ -62,7 +63,12 @@ def remarks(scene: Scene) -> Iterator[str]:
     aside = aside or ([] if aim is None else list(_aimed(scene, aim)))
     yield from aside or _of_test_images(scene)
     names = [frame.name for frame in sorted(scene.train, key=lambda frame: frame.time)]
-    if names == sorted(names) != (numbered := in_order(names)) and hexadecimal(names) is None:
+    read = None
+    with suppress(SceneError):  # names that do not tell
+        read = read_names(names, "")
+    is_told = read is not None and read.frames == sorted(read.frames)  # 0.04 is before 0.2
+    is_told |= hexadecimal(names) is not None
+    if names == sorted(names) != (numbered := in_order(names)) and not is_told:
         got, due = next(pair for pair in zip(names, numbered) if pair[0] != pair[1])
         line = f"times follow the images' names as texts, not their numbers ({got} comes where {due} is due)"
         yield f"{line}; count them in the order of the numbers"

@@ -15,7 +15,6 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -30,7 +29,6 @@ from forewarp.data.directions import inverted, refuse_other_readings
 from forewarp.data.files import SIDE as SIDE_FILES
 from forewarp.data.files import (
     SUFFIXES,
-    SceneError,
     layout_of,
     mismatch,
     number,
@@ -49,7 +47,7 @@ from forewarp.data.images import (
     inspect_image,
     read_image,
 )
-from forewarp.data.names import hexadecimal, in_order, read_names
+from forewarp.data.names import in_order, read_names
 from forewarp.data.rigs import held_cameras, held_moments, split_rig
 from forewarp.data.video import VIDEOS, extracted, stamps_of
 from forewarp.files import written_whole
@@ -74,7 +72,7 @@ class _Track:
     """What a camera took: a video at ``path``, or ``images`` in a folder, ``size`` (width, height) on disk.
 
     ``stamps`` are the seconds of a video's frames, None of a folder; ``turned`` the images that their EXIF
-    orientation turns.
+    orientation turns; ``numbers`` are those in their names, ascending.
     """
 
     path: Path
@@ -82,6 +80,7 @@ class _Track:
     stamps: np.ndarray | None = None
     images: tuple[Path, ...] = ()
     turned: frozenset[Path] = frozenset()
+    numbers: np.ndarray | None = None
 
     def __len__(self) -> int:
         return len(self.images) if self.stamps is None else len(self.stamps)
@@ -101,6 +100,7 @@ def read_scene(
     test_moments: Sequence[int] | None = None,
     test_every: int = 1,
     camera_order: str | None = None,
+    name_pattern: str | None = None,
     near: float | None = None,
     far: float | None = None,
     box: Sequence[float] | None = None,
@@ -117,6 +117,8 @@ def read_scene(
         test_every: measure held-out cameras at every n-th moment only.
         camera_order: of the rows of poses: by the ``number`` in the cameras' names, or as ``text`` (cam1,
             cam10, cam2); None: where these differ, that in which neighbouring views agree.
+        name_pattern: regular expression that reads ``time`` or ``frame`` in the names of folders' images;
+            None: what these say in one way.
         near, far: along the unit ray, the file's units; None: what holds all depths of the file.
         box: x0 y0 z0 x1 y1 z1 in the file's units; None takes all that the cameras see from near to far.
         normalise: put what is looked at into the origin and the farthest camera at distance 1.
@@ -131,7 +133,7 @@ def read_scene(
     scale, every = whole(scale, "data.scale", 1), whole(test_every, "data.test_every", 1)
     paths, others = _paths(folder)
     one_of(camera_order, "data.camera_order", "number", "text", None)
-    tracks = [_look(path) for path in paths.values()]
+    tracks = [_look(path, name_pattern) for path in paths.values()]
     images = lambda: [small_image(_first_image(track)) for track in tracks]  # noqa: E731
     key = "set data.camera_order=number or data.camera_order=text"
     rows = getattr(load_numpy(folder / FILE), "shape", ())[:1] if others else ()
@@ -333,19 +335,20 @@ def _first_image(track: _Track) -> Tensor:
     return torch.from_numpy(next(extracted(track.path, [0], None)).copy())
 
 
-def _look(path: Path) -> _Track:
+def _look(path: Path, name_pattern: str | None) -> _Track:
     """Find the size and number of a camera's frames."""
     if path.is_dir():
-        images, turned, size = tuple(_images(path)), set(), None
-        if (odd := hexadecimal([image.stem for image in images])) is not None:
-            advice = "rename images by decimal numbers"
-            raise mismatch(path, "names that tell the order", f"hexadecimal ones, as {odd}", advice)
+        images, turned, size = _images(path), set(), None
+        read = read_names([image.stem for image in images], str(path), name_pattern, one_camera=True)
+        numbers = np.arange(len(images)) if read is None else np.array(read.frames)
+        order = np.argsort(numbers, kind="stable")
+        images, numbers = tuple(images[i] for i in order), numbers[order]
         for image in images:
             header = inspect_image(image, size, " as the first")
             size = header.size
             turned |= {image} if header.is_turned else set()
         place = path.parent if path.name == "images" else path
-        return _Track(place, size, None, images, frozenset(turned))
+        return _Track(place, size, None, images, frozenset(turned), numbers)
     stamps = stamps_of(path)
     first = next(extracted(path, [0], None), None) if len(stamps) else None
     if first is None:
@@ -400,13 +403,7 @@ def _times(tracks: Sequence[_Track], count: int, folder: Path) -> tuple[list[flo
     also say in a line where these are not even.
     """
     film = next((track for track in tracks if track.stamps is not None), None)
-    clock, even = np.arange(count), np.arange(count) / max(count - 1, 1)
-    if film is not None:
-        clock = film.stamps[:count]
-    else:
-        with suppress(SceneError):  # names that do not tell
-            read = read_names([image.stem for image in tracks[0].images[:count]], str(folder))
-            clock = clock if read is None else np.array(read.frames)
+    clock, even = (film.stamps if film else tracks[0].numbers)[:count], np.arange(count) / max(count - 1, 1)
     if count < 2 or not (np.diff(clock) > 0).all():
         return even.tolist(), []
     times = (clock - clock[0]) / (clock[-1] - clock[0])

@@ -8,6 +8,7 @@ import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime, timezone
+from functools import partial
 from itertools import accumulate
 from statistics import median
 from typing import NamedTuple
@@ -18,33 +19,56 @@ from forewarp.data.files import SceneError, mismatch
 
 KEY = "set data.name_pattern (of forewarp-capture: name_pattern) to a regular expression with a group"
 KEY += " 'frame' or 'time', and 'camera' for a rig"
-# A number in a name; seconds, as of TUM's data or ROS, are Unix time, or fill the name to the microsecond.
-_NUMBER = r"((?<!\d)\d{9,10}\.\d+|(?<![^/])\d+\.(?:\d{6}|\d{9})(?=$|\.[A-Za-z])|\d+)"
-# Date and time of day, with or without thousandths of a second, as phones and screenshots name images.
-_DATED = re.compile(
-    r"(?<!\d)((?:19|20)\d\d)([-_.]?)(\d\d)\2(\d\d)(?: at |[-_ T.])?"
-    r"(?:(\d\d)(\d\d)(\d\d)|(\d\d?)([-_.:])(\d\d)(?:\9(\d\d))?)(?:\.?(\d{3}))?(?!\d)"
-    r"(?:\s?([AaPp])\.?[Mm]\b\.?)?"
-)
-_DATE = re.compile(r"(?<!\d)((?:19|20)\d\d)([-_.]?)(0[1-9]|1[0-2])\2([0-2]\d|3[01])(?!\d)")
+# A number in a name; between zero bytes stands one that several parts of a name say together.
+_NUMBER = "(\0[^\0]+\0|\\d+)"
+_DECIMAL = "(\0[^\0]+\0|(?<!\\d)\\d\\d\\.\\d{3}(?!\\.?\\d)|(?<![\\d.])\\d+(?:\\.\\d+)?(?!\\.?\\d))"
+# Seconds, as of TUM's data or ROS, are Unix time, or fill the name to the microsecond.
+_STAMP = re.compile(r"(?<![\d\0])\d{9,10}\.\d+|(?<![^/])\d+\.(?:\d{6}|\d{9})(?=$|\.[A-Za-z])")
 _STOPWATCH = re.compile(r"(?<!\d)(\d\d?)h(\d\d)m(\d\d)s(\d{3})?(?!\d)")  # as media players write it
 _SECONDS_NANOSECONDS = re.compile(r"(?<!\d)(\d{9,10})[_-](\d{9})(?!\d)")
+# Date and time of day as phones, screenshots and loggers write them.
+_HALF, _IS_HALF = r"[\s_-]?(?P<half>[AaPp])\.?[Mm]\b\.?", r"[\s_-]?[AaPp]\.?[Mm]\b"
+_FRACTION = r"(?:[.,]?(?P<f>\d{3}|\d{6}|\d{9}))?"
+_PACKED = rf"(?P<H>\d\d)(?P<M>\d\d)(?:(?P<S>\d\d){_FRACTION})?(?:{_HALF})?(?!\d)"
+_APART = rf"(?P<H>\d\d?)(?P<c>[-_.:])(?P<M>\d\d)(?:(?P=c)(?P<S>\d\d){_FRACTION}|(?={_IS_HALF}))"
+_APART += rf"(?:{_HALF})?(?!\d)"
+_OF_DATE = {"Y": r"(?P<Y>(?:19|20)\d\d)", "y": r"(?P<y>[0-4]\d)", "m": r"(?P<m>\d\d)", "d": r"(?P<d>\d\d)"}
+
+
+def _date(order: str, behind: str = r"(?!\d)") -> re.Pattern:
+    """Make the pattern of a date, ``order`` as ``dmY``, and what stands ``behind`` it."""
+    first, second, third = (_OF_DATE[part] for part in order)
+    if order in ("dmY", "mdY"):  # 4.11.2023
+        first, second = (part.replace(r"\d\d", r"\d\d?") for part in (first, second))
+    return re.compile(rf"(?<![\d\0]){first}(?P<sep>[-_.]|(?<=\d\d)){second}(?P=sep){third}{behind}")
+
+
+_TIME_OF_DAY, _COUNTER = "times of day", "a counter"
+_WITH_TIME = (rf"(?: at |,? |[-_T.])?{_PACKED}", rf"(?: at |,? |[-_T.]){_APART}", r"(?!\d)")
+_DATED = [_date("Ymd", behind) for behind in _WITH_TIME[:2]]  # which nothing else can be
 _FRAME_WORD = re.compile(r"(?i)(?:^|[^a-z])(frame|time|t)[_-]?$")
 _CAMERA_WORD = re.compile(r"(?i)(?:^|[^a-z])(cam|camera|view|sensor|c|v)[_( -]*$")
 _LETTER_WORD = re.compile(r"(?i)(?:^|[^a-z])[cv][_( -]*$")  # before two digits at most: C0001 is a clip
 # Before a number: of films that cameras count, or that are cut into parts.
 _FILM_WORD = re.compile(
-    r"(?i)(?:^|[^a-z])(c|gx|gh|gopr|gp|mvi|dsc|img|vid|mov|dji|clip|part|chapter|take|seg)[_-]?$"
+    r"(?i)(?:^|[^a-z])(c|gx|gh|gopr|gp|mvi|dsc|img|vid|mov|dji|clip|part|chapter|take|seg|seq|sequence|shot"
+    r"|session|run|trial)[_-]?$"
 )
+_FRAME = re.compile(r"(?i)(?:^|[^a-z])frame[_-]?$")
 _OF_FILM = re.compile(r"(?i)^\.(mp$|m$|mov|mkv|avi|mts|webm)")  # behind it, up to the next number
 _SPLIT_WORD = re.compile(r"(?i)(?:^|/)(train|val|valid|validation|eval|test)\b")
 _OF_TIME = re.compile(r"(?:(\d+)[h:_.-])?(\d{1,2})[m:_.-](\d\d(?:[.,]\d+)?)s?")  # of a group ``time``
 _EXPONENT = re.compile(r"\d\.\d*[eE][-+]?\d")
 _HEXADECIMAL = re.compile(r"[0-9a-f]+|[0-9A-F]+")
-_CLOCK = re.compile(r"([01]\d|2[0-3])([0-5]\d)([0-5]\d)?")  # digits that may be a time of day
 _ODD = 0.2  # share of the names that may have another form than all others, and are then named in the error
 _GAPS = 4  # numbers for one that is there, in a counter with gaps
+_ROUNDING = 1e-6  # of steps that are even
 _LEAST_WORDS = 4  # different texts beside the numbers, from which on these may tell nothing
+_FEW = 4  # names below which a plain counter may look like a time by chance
+_EVEN, _UNEVEN = 0.5, 4.0  # longest step by the shortest, less 1: at most, times that of the best reading
+_SAME_TIMES = 0.25  # of the shortest step, by which times of two readings may differ that mean one thing
+_RATES = (24, 25, 30, 50, 60)  # frames a second of time codes
+_SKIPPED = 4  # numbers at most that time codes leave out at the beginning of a minute
 _CARRY = 3.0  # steps of the last number from its end and its beginning within which it is carried over
 _ODD_ALONE = 4  # images of a camera from which on one of a single image is an odd name
 _SAME_FRAMES = 0.8  # share of all frame numbers that each camera must have where no word tells the camera
@@ -74,39 +98,87 @@ def name_parts(name: str) -> list[str | float]:
     >>> name_parts("PXL_20240501_235959500"), name_parts("2024-05-02_00-00-00")
     (['PXL_', 1714607999.5, ''], ['', 1714608000.0, ''])
     """
-    parts = _split(name)
+    parts = _split(_in_seconds(name))
     parts[1::2] = (float(part) if "." in part else int(part) for part in parts[1::2])
     return parts
 
 
 def _split(name: str) -> list[str]:
-    """Split a name into text, at even places, and digits; date and time of day are written as seconds."""
-    return re.split(_NUMBER, _in_seconds(name))
+    """Split a name into text, at even places, and numbers."""
+    parts = re.split(_NUMBER, name)
+    parts[1::2] = (part.strip("\0") for part in parts[1::2])
+    return parts
 
 
 def _in_seconds(name: str) -> str:
-    """Write date and time of day, stopwatches, and seconds with nanoseconds as numbers."""
-    return _SECONDS_NANOSECONDS.sub(r"\1.\2", _STOPWATCH.sub(_milliseconds, _DATED.sub(_seconds, name)))
+    """Mark what nothing else can be: date and time of day, stopwatches, and seconds with a fraction."""
+    for pattern in _DATED:
+        name = pattern.sub(lambda match: _marked(_instant(match)) or match[0], name)
+    name = _SECONDS_NANOSECONDS.sub("\0\\1.\\2\0", _STOPWATCH.sub(_milliseconds, name))
+    return _STAMP.sub("\0\\g<0>\0", name)
 
 
-def _seconds(match: re.Match) -> str:
-    """Write date and time of day as seconds since 1970; other digits stay as they are."""
-    year, _, month, day, *packed, hour, _, minute, second, thousandths, half = match.groups()
-    hour, minute, second = packed if packed[0] else (hour, minute, second)
-    if second is None and half is None:  # of two numbers after a date neither need be of a clock
-        return match[0]
-    hour = int(hour) if half is None else int(hour) % 12 + 12 * (half in "Pp")
+def _marked(seconds: float | None) -> str | None:
+    return None if seconds is None else f"\0{seconds:.9f}\0"
+
+
+def _instant(match: re.Match) -> float | None:
+    """Return the seconds since 1970 of date and time of day, of which two numbers alone need not be of a
+    clock; None where there is no such date.
+    """
+    part = match.groupdict()
+    is_whole = part["sep"] or len(part["m"]) + len(part["d"]) == 4
+    is_short = part.get("y") and (part["sep"] if not part.get("H") else not part["S"])
+    if not is_whole or is_short:
+        return None
+    year = int(part.get("Y") or 2000 + int(part["y"]))
     try:
-        parts = (int(part) for part in (year, month, day, hour, minute, second or 0))
-        date = datetime(*parts, tzinfo=timezone.utc)
+        day = datetime(year, int(part["m"]), int(part["d"]), tzinfo=timezone.utc)
     except ValueError:
-        return match[0]
-    return f"{int(date.timestamp())}.{thousandths or '000'}000"
+        return None
+    seconds = _of_day(match) if part.get("H") else 0.0
+    return None if seconds is None else day.timestamp() + seconds
+
+
+def _of_day(match: re.Match) -> float | None:
+    """Return the seconds since midnight of a time of day; None where there is no such time."""
+    part = match.groupdict()
+    hour, minute, second = (int(part[key] or 0) for key in "HMS")
+    if half := part.get("half"):
+        hour = hour % 12 + 12 * (half in "Pp")
+    fraction = float(f"0.{part.get('f') or 0}")
+    return (hour * 60 + minute) * 60 + second + fraction if hour < 24 and max(minute, second) < 60 else None
+
+
+def _of_code(match: re.Match, rate: int) -> float | None:
+    """Return the number of a frame by its time code; None where there is no such one."""
+    hour, minute, second, frame = map(int, match.groups())
+    is_code = hour < 24 and max(minute, second) < 60 and frame < rate
+    return ((hour * 60 + minute) * 60 + second) * rate + frame if is_code else None
 
 
 def _milliseconds(match: re.Match) -> str:
     hours, minutes, seconds, thousandths = (int(part or 0) for part in match.groups())
-    return str(((hours * 60 + minutes) * 60 + seconds) * 1000 + thousandths)
+    return f"\0{((hours * 60 + minutes) * 60 + seconds) * 1000 + thousandths}\0"
+
+
+_ORDERS = {
+    "Ymd": "dates that begin with the year",
+    "dmY": "dates that begin with the day",
+    "mdY": "dates that begin with the month",
+    "ymd": "dates that begin with two digits of the year",
+    "dmy": "dates that begin with the day and end with two digits of the year",
+    "mdy": "dates that begin with the month and end with two digits of the year",
+}
+_TIME_CODE = re.compile(r"(?<![\d\0])(\d\d)(\d\d)(\d\d)(\d\d)(?!\d)")
+_APART_CODE = re.compile(r"(?<!\d)\d\d([-_.:])\d\d\1\d\d[-_.:;]\d\d(?!\d)")
+# What numbers of a name may say together, and how it is read.
+_FORMS: list[tuple[str, re.Pattern, Callable[[re.Match], float | None]]] = [
+    *((what, _date(order, behind), _instant) for order, what in _ORDERS.items() for behind in _WITH_TIME),
+    (_TIME_OF_DAY, re.compile(rf"(?<![\d\0])(?=\d{{6}}){_PACKED}"), _of_day),
+    (_TIME_OF_DAY, re.compile(rf"(?<![\d\0])(?=[-_.:\d]+{_IS_HALF}){_APART}"), _of_day),
+    *((f"time codes of {rate} frames a second", _TIME_CODE, partial(_of_code, rate=rate)) for rate in _RATES),
+]
 
 
 class NameNumbers(NamedTuple):
@@ -164,6 +236,7 @@ def read_names(
     where: str,
     pattern: str | None = None,
     views: Sequence[Sequence[float]] | None = None,
+    one_camera: bool = False,
 ) -> NameNumbers | None:
     """Read a frame number or a time from each name, if there is one way to read them.
 
@@ -175,6 +248,7 @@ def read_names(
             every name; None: see the rules below.
         views: a row of numbers for each image, near where cameras stand and look alike, such as their
             positions; they tell cameras of a rig from parts of one film.
+        one_camera: took all images: several numbers are of one film.
 
     Returns:
         the numbers; None where names have no number that varies, or have one twice and no other.
@@ -195,25 +269,27 @@ def read_names(
     """
     if pattern is not None:
         return _by_pattern(names, where, pattern)
+    if not names:
+        return None
     if (name := hexadecimal(names)) is not None:
         what = "what is beside the numbers differs from image to image, as of hexadecimal numbers"
         raise _two_ways(where, name, what)
-    rows = _of_one_form(_with_days(names), names, where) if names else None
-    if rows is None:
-        return None
     if any(map(_EXPONENT.search, names)):
         raise _two_ways(where, names[0], "numbers with exponents")
-    fractions = [i for i in range(3, len(rows[0]), 2) if _joined_fraction(rows, i)]
-    for i in range(1, len(rows[0]), 2):
-        _read_clock(rows, i, names[0], where)
+    written = [_STOPWATCH.sub(_milliseconds, name) for name in names]
+    written = _with_fractions(_composed(written, where), where)
+    rows = _of_one_form(written, names, where)
+    if rows is None:
+        return None
+    fractions = [i for i in range(3, len(rows[0]), 2) if _joined_fraction(rows, i, names[0], where)]
     places = [i for i in range(1, len(rows[0]), 2) if len({float(row[i]) for row in rows}) > 1]
     places = [i for i in places if i not in fractions]
     words = {tuple(re.sub("[^a-z]", "", row[i].lower()) for i in range(0, len(row), 2)) for row in rows}
-    if not places or all(_camera_word(rows, i) for i in places):
+    if not places or (not one_camera and all(_camera_word(rows, i) for i in places)):
         return None
     if len(words) >= max(_LEAST_WORDS, len(names) / 2):
         raise _two_ways(where, names[0], "what is beside the numbers differs from image to image")
-    reading = _chosen(rows, places, names[0], where, views)
+    reading = _chosen(rows, places, names[0], where, views, one_camera)
     if reading is None:
         return None
     frames, told = _unrolled(reading)
@@ -319,7 +395,7 @@ def _hexadecimal(names: Sequence[str]) -> str | None:
 
 def _number_of(text: str | None) -> float:
     """Read the number that a group of a pattern found, or the seconds of a time of day; else NaN."""
-    text = _in_seconds(text or "")
+    text = _in_seconds(text or "").replace("\0", "")
     if match := _OF_TIME.fullmatch(text):
         hours, minutes, seconds = match[1] or 0, match[2], match[3].replace(",", ".")
         if float(seconds) < 60 and int(minutes) < 60 and not re.fullmatch(r"\d+\.\d+", text):
@@ -330,20 +406,120 @@ def _number_of(text: str | None) -> float:
         return math.nan
 
 
-def _with_days(names: Sequence[str]) -> Sequence[str]:
-    """Write the dates of all names as seconds since 1970, where they vary and have no time of day."""
-    dates = [_DATE.search(_in_seconds(name)) for name in names]
-    if None in dates or len({match[0] for match in dates}) < 2:
+def _composed(names: Sequence[str], where: str) -> Sequence[str]:
+    """Mark what numbers of all names say together, such as a date, where it varies; longer ones go first.
+
+    Raises:
+        SceneError: naming the readings where two survive.
+    """
+    found: dict[tuple[int, int], dict[str, tuple]] = {}
+    for what, pattern, read in _FORMS:
+        matches = [[*pattern.finditer(name)] for name in names]
+        for column in zip(*matches) if len({*map(len, matches)}) == 1 else ():
+            values = [*map(read, column)]
+            is_few = len({*values}) < min(_FEW, len(names)) and not column[0].groupdict().get("Y")
+            if None not in values and len({*values}) > 1 and not is_few:  # few are of cameras
+                found.setdefault(column[0].span(), {})[what] = (column, values)
+    found = {span: of for span, of in found.items() if not _FRAME.search(names[0][: span[0]])}
+    if not found:
         return names
-    try:
-        days = [datetime(*map(int, match.group(1, 3, 4)), tzinfo=timezone.utc) for match in dates]
-    except ValueError:
+    of = found[max(found, key=lambda span: span[1] - span[0])]
+    of = {what: read for what, read in of.items() if read[0][0].groupdict().get("Y")} or of
+    column = next(iter(of.values()))[0]
+    readings = {what: values for what, (_, values) in of.items()}
+    counts = [float(re.sub(r"\D", "", match[0])) for match in column]
+    part = column[0].groupdict()
+    no_seconds = part.get("H") and not part["S"] and not part["half"]
+    may_count = no_seconds or (column[0][0].isdigit() and not part.get("Y"))
+    if may_count and (len(names) < _FEW or _unevenness(counts) < _ROUNDING):
+        readings[_COUNTER] = counts
+    if np.ptp(readings.get(_TIME_OF_DAY, 0)) > 12 * 3600 and _unevenness(counts) >= _ROUNDING:
+        raise _two_ways(where, names[0], "times of day more than half a day apart")
+    values = readings[_survivor(readings, names[0], where)]
+    marked = [f"{m.string[: m.start()]}{_marked(v)}{m.string[m.end() :]}" for m, v in zip(column, values)]
+    return _composed(marked, where)
+
+
+def _survivor(readings: Mapping[str, Sequence[float]], name: str, where: str) -> str:
+    """Choose the first of readings that agree, or the one whose steps are even where no other's are.
+
+    Raises:
+        SceneError: naming the readings where there is none.
+    """
+    first, *others = readings
+    differ = [what for what in others if not _agree(readings[first], readings[what])]
+    if not differ:
+        return first
+    ranked = sorted(readings, key=lambda what: _unevenness(readings[what]))
+    best = _unevenness(readings[ranked[0]])
+    rest = [what for what in ranked[1:] if not _agree(readings[ranked[0]], readings[what])]
+    if best <= _EVEN and all(_unevenness(readings[what]) > _UNEVEN * best + 0.05 for what in rest):
+        return ranked[0]
+    raise _two_ways(where, name, ", or ".join((first, *differ)))
+
+
+def _unevenness(values: Sequence[float]) -> float:
+    """Return how much longer the longest step between values is than the shortest, in shares of that."""
+    steps = np.diff(np.unique(values))
+    return float(steps.max() / steps.min()) - 1 if len(steps) else 0.0
+
+
+def _agree(one: Sequence[float], other: Sequence[float]) -> bool:
+    """Tell whether two readings say the same times, but for their beginning and unit."""
+    both = [np.asarray(values, np.float64) for values in (one, other)]
+    first, second = ((values - values.min()) / (np.ptp(values) or 1) for values in both)
+    steps = [np.diff(np.unique(values)).min(initial=1) for values in (first, second)]
+    return float(np.abs(first - second).max()) <= _SAME_TIMES * min(steps)
+
+
+def _with_fractions(names: Sequence[str], where: str) -> Sequence[str]:
+    """Mark seconds with a fraction behind a point, written with as many digits in all names or as needed."""
+    rows = [re.split(_DECIMAL, name) for name in names]
+    if len({*map(len, rows)}) > 1:
         return names
-    whole = (f"{int(day.timestamp())}.000000" for day in days)
-    return [
-        f"{match.string[: match.start()]}{day}{match.string[match.end() :]}"
-        for match, day in zip(dates, whole)
-    ]
+    for i in range(1, len(rows[0]), 2):
+        is_camera = _word(rows, i, _CAMERA_WORD) and not _word(rows, i, _FRAME_WORD)
+        if any("\0" in row[i] for row in rows) or is_camera or len({row[i] for row in rows}) == 1:
+            continue
+        values = _decimals(rows, i, where)
+        for row, value in zip(rows, values or ()):
+            row[i] = _marked(value)
+    return ["".join(row) for row in rows]
+
+
+def _decimals(rows: list[list[str]], place: int, where: str) -> list[float] | None:
+    """Read the numbers at a place with what is behind their points; None where that is a counter.
+
+    A fraction of one width is one if it is behind a word for time or Unix time, or reaches half of a whole; a
+    counter's numbers are small. One of several widths has no zero at its end; a number of nanoseconds, which
+    lacks the zeros before it, reaches half of a whole.
+    """
+    whole, _, behind = zip(*(row[place].partition(".") for row in rows))
+    widths, most = {*map(len, behind)}, max((int(text or 0) for text in behind), default=0)
+    if (width := max(widths)) == 0:
+        return None
+    decimals = [float(f"{number}.{text or 0}") for number, text in zip(whole, behind)]
+    is_stamp = all(9 <= len(number) <= 10 for number in whole)
+    if len(widths) == 1:
+        are_whole = all(len(row) == 3 and row[0][-1:] in ("", "/") and not row[2] for row in rows)
+        is_sure = is_stamp or (are_whole and width in (6, 9)) or _word(rows, place, _FRAME_WORD)
+        # Two digits up to 59 are minutes or seconds.
+        reaches = width > 1 and most >= 0.5 * 10**width and (width > 2 or most >= 60)
+        return decimals if is_sure or reaches else None
+    readings = {}
+    if not any(len(text) > 1 and text[-1] == "0" for text in behind):
+        readings["seconds with a fraction"] = decimals
+    is_filled = any(not text or (len(text) > 1 and text[0] == "0") for text in behind)
+    unit = next((unit for unit in (10**3, 10**6, 10**9) if most < unit), None)
+    if unit and not is_filled and most >= 0.5 * unit:
+        counts = [int(number) + int(text) / unit for number, text in zip(whole, behind)]
+        readings["seconds and a whole number of parts of one"] = counts
+    if not is_filled and width <= 6 and not is_stamp:
+        readings[_COUNTER] = [float(number) * 10**width + int(text) for number, text in zip(whole, behind)]
+    if not readings:
+        return None
+    what = _survivor(readings, "".join(rows[0]), where)
+    return None if what == _COUNTER else readings[what]
 
 
 def _of_one_form(written: Sequence[str], names: Sequence[str], where: str) -> list[list[str]] | None:
@@ -369,6 +545,11 @@ def _of_one_form(written: Sequence[str], names: Sequence[str], where: str) -> li
         like = names[counts.index(usual)]
         more = f" and {len(odd) - 1} more" if len(odd) > 1 else ""
         raise mismatch(where, f"names of one form, as '{like}'", f"'{odd[0]}'{more}", f"rename it, or {KEY}")
+    for i in range(1, min(counts), 2):
+        before = {row[i - 1] for row in rows}
+        if len({text.rstrip("-") for text in before}) < len(before):
+            what = "what is beside the numbers differs from image to image, as signs"
+            raise _two_ways(where, names[0], what)
     if odd:  # what differs is before the last number
         if min(counts) < 3:
             return None
@@ -392,51 +573,31 @@ def _tells_film(rows: Sequence[Sequence[str]], place: int) -> bool:
     return _word(rows, place, _FILM_WORD) or all(_OF_FILM.match(row[place + 1]) for row in rows)
 
 
-def _joined_fraction(rows: list[list[str]], place: int) -> bool:
-    """Join a fraction of a second to the seconds before it, and tell whether there was one.
-
-    Digits after a point are a fraction if all have one width and some reach half of a whole; a counter's are
-    small.
-    """
-    if any(row[place - 1] != "." or "." in row[place - 2] + row[place] for row in rows):
-        return False
-    if _camera_word(rows, place - 2):
-        return False
-    if not _word(rows, place - 2, _FRAME_WORD):
-        widths, most = {len(row[place]) for row in rows}, max(int(row[place]) for row in rows)
-        width = max(widths)
-        # Two digits up to 59 are minutes or seconds.
-        if len(widths) > 1 or width < 2 or most < 0.5 * 10**width or (width == 2 and most < 60):
-            return False
-    for row in rows:
-        row[place - 2] = f"{row[place - 2]}.{row[place]}"
-    return True
-
-
-def _read_clock(rows: list[list[str]], place: int, name: str, where: str) -> None:
-    """Turn digits that are a time of day in all names, ``103059`` or behind a date ``1030``, into seconds.
-
-    A counter that is none of these has a number whose last two digits are above 59, or grows by one step.
+def _joined_fraction(rows: list[list[str]], place: int, name: str, where: str) -> bool:
+    """Join a fraction of a second to Unix time or date and time before it, and tell whether there was one.
 
     Raises:
-        SceneError: for times more than half a day apart, whose film may have gone on after midnight.
+        SceneError: for a number that may be a fraction, or a counter that goes on through all seconds.
     """
-    digits = [row[place] for row in rows]
-    behind_a_day = place > 1 and all(
-        row[place - 1] in "-_" and _DATE.fullmatch(row[place - 2]) for row in rows
-    )
-    matches = [_CLOCK.fullmatch(text) for text in digits]
-    if None in matches or len({*digits}) < 2 or not (behind_a_day or all(match[3] for match in matches)):
-        return
-    counts = sorted({int(text) for text in digits})
-    is_even = len(counts) > 2 and len({b - a for a, b in zip(counts, counts[1:])}) == 1
-    if counts[-1] < (100 if len(digits[0]) == 4 else 10000) or (is_even and not behind_a_day):
-        return
-    seconds = [sum(f * int(part or 0) for f, part in zip((3600, 60, 1), match.groups())) for match in matches]
-    if max(seconds) - min(seconds) > 12 * 3600:
-        raise _two_ways(where, name, "times of day more than half a day apart")
-    for row, second in zip(rows, seconds):
-        row[place] = str(second)
+    between = {row[place - 1] for row in rows}
+    whole = [row[place - 2].partition(".") for row in rows]
+    is_whole = all(9 <= len(second) <= 10 and not int(rest or 0) for second, _, rest in whole)
+    behind = [row[place] for row in rows]
+    if len(between) > 1 or not between <= {*".,_-"} or not is_whole or any("." in text for text in behind):
+        return False
+    widths, most = {*map(len, behind)}, max(map(int, behind))
+    unit = 10 ** max(widths) if len(widths) == 1 else next((u for u in (10**3, 10**6, 10**9) if most < u), 0)
+    if most < 0.5 * unit or not unit or (between <= {*"_-"} and (unit == 10 or (unit == 100 and most < 60))):
+        return False
+    pairs = sorted({(int(second[0]), int(text)) for second, text in zip(whole, behind)})
+    goes_on = all(a[1] < b[1] for a, b in zip(pairs, pairs[1:])) and pairs[0][0] < pairs[-1][0]
+    if goes_on and between <= {*"_-"}:
+        if unit in (10**3, 10**6, 10**9) and len(pairs) <= _FEW:
+            raise _two_ways(where, name, "fractions of the seconds, or a counter")
+        return False
+    for row, second, text in zip(rows, whole, behind):
+        row[place - 2] = f"{int(second[0]) + int(text) / unit:.9f}"
+    return True
 
 
 def _chosen(
@@ -445,6 +606,7 @@ def _chosen(
     name: str,
     where: str,
     views: Sequence[Sequence[float]] | None,
+    one_camera: bool,
 ) -> _Reading | None:
     """Choose the one reading that survives; ``name`` is the first, for errors.
 
@@ -469,14 +631,41 @@ def _chosen(
         if unique := [reading for reading in readings if reading.is_unique]:
             return unique[0]
     together, parts = "all numbers together order one film", of_place(free[-1], for_cameras).cameras
-    film = _Reading(together, _ranked(rows, free), parts)
+
+    def of_film(order: Sequence[int], must_tell: bool) -> _Reading:
+        times = _ranked(rows, order)
+        if times is None and must_tell:
+            raise _two_ways(where, name, f"{together}, and not how much time lies between its parts")
+        keys = [tuple(float(row[i]) for i in order) for row in rows]
+        ranks = {key: float(rank) for rank, key in enumerate(sorted({*keys}))}
+        return _Reading(together, times or [ranks[key] for key in keys], parts)
+
+    if one_camera:
+        order = [i for i in free if i not in named[-1:]] + named[-1:]
+        counts = [len({row[i] for row in rows}) for i in order]
+        whole = _Reading("", [*range(len(rows))], [*zip(parts, *([row[i] for row in rows] for i in order))])
+        if len({*whole.cameras}) < len(rows):
+            return None
+        last = of_place(order[-1], ())
+        if len({*last.frames}) == len(rows) and len(named or free) == 1:
+            return last
+        film, rig = of_film(order, must_tell=False), of_place(order[-1], order)
+        keys = sorted({tuple(float(row[i]) for i in order) for row in rows})
+        is_clock = all(len(row[order[-2:][0]].partition(".")[0]) >= 9 for row in rows)
+        is_told = len(order) > 1 and (is_clock or _carries(keys, 60))
+        is_told |= any(_tells_film(rows, i) for i in order[:-1]) or _APART_CODE.search(name) is not None
+        is_rig = for_cameras or len({*film.frames}) < len(rows) or max(counts) > counts[-1]
+        if is_rig or (rig.is_shared and not is_told):
+            raise _two_ways(where, name, "images of several cameras, or parts of one film")
+        return replace(of_film(order, must_tell=True), cameras=[()] * len(rows))
+    film = of_film(free, must_tell=False)
     if named or len(free) == 1:
         reading = of_place((named or free)[-1], places)
         if not reading.is_unique:
             return None
-        parts = [(tuple(row[i] for i in texts), *(float(row[i]) for i in places)) for row in rows]
-        order = {part: float(rank) for rank, part in enumerate(sorted({*parts}))}
-        film = _Reading(together, [order[part] for part in parts], [()] * len(rows))
+        keys = [(tuple(row[i] for i in texts), *(float(row[i]) for i in places)) for row in rows]
+        ranks = {key: float(rank) for rank, key in enumerate(sorted({*keys}))}
+        film = _Reading(together, [ranks[key] for key in keys], [()] * len(rows))
         is_shared = len({*reading.frames}) < len(rows) and film.is_unique
         is_film = is_shared and views is not None and _path(reading, film, views) == "film"
         if is_film and not _returns(reading, views):
@@ -499,7 +688,7 @@ def _chosen(
             return near[0]
     are_parts = film.is_unique and last.is_apart
     if film.is_unique and (path == "film" or (path is None and are_parts and not rigs)):
-        return film
+        return of_film(free, must_tell=True)
     readings = [f"{one.what} ({len({*one.frames})} times)" for one in (*rigs, film)]
     raise _two_ways(where, name, ", or ".join(readings))
 
@@ -520,12 +709,14 @@ def _step(rig: _Reading, views: Sequence[Sequence[float]]) -> float:
     return 0.0 if middle <= _STILL * float(np.ptp(places, axis=0).max()) else middle
 
 
-def _ranked(rows: Sequence[Sequence[str]], places: Sequence[int], may_carry: bool = True) -> list[float]:
+def _ranked(
+    rows: Sequence[Sequence[str]], places: Sequence[int], may_carry: bool = True
+) -> list[float] | None:
     """Number names by several numbers, the first of which weighs most; gaps in the last stay.
 
     Where the last number grows all the way, as of frames counted through all chapters, it is the frame's.
     Where it is carried over, as of minutes and seconds, both are one number, if it ``may_carry``. Else a part
-    goes on one step after the one before it.
+    goes on one step after the one before it; None where parts are missing, or do not begin anew.
     """
     keys = [tuple(float(row[i]) for i in places) for row in rows]
     ordered = sorted({*keys})
@@ -533,17 +724,28 @@ def _ranked(rows: Sequence[Sequence[str]], places: Sequence[int], may_carry: boo
     if all(a < b for a, b in zip(last, last[1:])):
         return [key[-1] for key in keys]
     joined, unit = dict(zip(ordered, ordered)), 1.0
-    for place in places[:0:-1] if may_carry else ():  # minutes and seconds, seconds and a fraction
+    for part, place in list(zip(places, places[1:]))[::-1] if may_carry else ():  # minutes and seconds
+        if _tells_film(rows, part):
+            break
         widths = {len(row[place]) for row in rows}
         bases = [60 * unit, *[10.0**width * unit for width in widths if len(widths) == 1]]
         base = next((base for base in bases if _carries(sorted({*joined.values()}), base)), None)
         if base is None:
             break
+        values = sorted({*joined.values()})
+        meets = {(a[-1], b[-1]) for a, b in zip(values, values[1:]) if a[:-1] != b[:-1]}
+        base -= meets == {(base - 1, 1.0)} and base > 60  # counters that begin at 1
         joined = {key: (*part[:-2], part[-2] * base + part[-1]) for key, part in joined.items()}
         unit = base
     pairs = list(zip(joined.values(), list(joined.values())[1:]))
     steps = [b[-1] - a[-1] if a[:-1] == b[:-1] else None for a, b in pairs]
     usual = median([step for step in steps if step is not None] or [1.0])
+    meets = [(a[:-1], b) for (a, b), step in zip(pairs, steps) if step is None]
+    gaps = {next(y - x for x, y in zip(a, b) if x != y) for a, b in meets}
+    is_next = len(gaps) == 1 and math.log10(min(gaps)) % 1 == 0  # GoPro's GX010042, GX020042 also
+    are_whole = is_next and all(b[-1] - min(last) <= max(usual, _SKIPPED) for _, b in meets)
+    if may_carry and meets and not are_whole:
+        return None
     sums = accumulate((usual if step is None else step for step in steps), initial=ordered[0][-1])
     frames = dict(zip(ordered, sums))
     return [frames[key] for key in keys]

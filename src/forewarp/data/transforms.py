@@ -11,7 +11,10 @@ from __future__ import annotations
 import math
 import os
 import re
+from bisect import bisect_right
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from reprlib import repr as short
@@ -71,6 +74,9 @@ _MOST_TIME = 1e20
 _OWN_NUMBERS = 0.5  # share of training's span that frames of an own numbering leave, and of these that tell
 _LEAST_UNIT = 0.5  # of all times, that those in [0, 1] span
 _ROUNDING = 1e-6  # beyond 0 and 1
+_FEW = 0.1  # share of the frames, one at least, whose times are in doubt where those of all others agree
+_LEAST_FRAMES = 6  # from which on their order tells
+_APART = 3.0  # longest steps of all other times, by which one is far from them
 
 
 @dataclass(frozen=True)
@@ -529,13 +535,17 @@ def times_of(
     given = [time is not None for time in times]
     if pattern is None and all(given):
         first, last = min(times), max(times)
-        span = f"{where}: all times lie from {first:.10g} to {last:.10g}"
+        span = f"all times lie from {first:.10g} to {last:.10g}"
+        odd = _odd_time(names, times)
         if not _within_unit(times):
             length, taken = last - first, "taken as 0 to 1" if last > first else "taken as one moment"
-            return [(time - first) / (length or 1) for time in times], f"{span}: {taken}"
-        line = f"{span}, where 0 to 1 is the whole sequence"
-        times = [min(max(time, 0.0), 1.0) for time in times]
-        return times, line if len(times) > 1 and last - first < LEAST_SPAN else None
+            lines = [f"{span}: {taken}", odd]
+            times = [(time - first) / (length or 1) for time in times]
+        else:
+            is_short = len(times) > 1 and last - first < LEAST_SPAN
+            lines = [f"{span}, where 0 to 1 is the whole sequence" if is_short else "", odd]
+            times = [min(max(time, 0.0), 1.0) for time in times]
+        return times, f"{where}: {'; '.join(filter(None, lines))}" if any(lines) else None
     if pattern is None and any(given):
         got = f"{sum(given)} of {len(given)}, and none for {names[given.index(False)]}"
         raise mismatch(f"{where}: frames: time", "one in all frames or in none", got)
@@ -547,6 +557,48 @@ def times_of(
         line = f"{where}: {why}: spread evenly in the order of the images' names"
         return [rank / last for rank in np.argsort(order).tolist()], line
     return read.times, f"{where}: {why}: {read.told}"
+
+
+def _odd_time(names: Sequence[str], times: Sequence[float]) -> str:
+    """Say that a few times are out of the order of the numbers in the images' names, of one folder, or are
+    those of other images, where all others follow it; nothing where they do not.
+    """
+    folders: dict[str, list[int]] = {}
+    for i, name in enumerate(names):
+        folders.setdefault(name.rpartition("/")[0], []).append(i)
+    for rows in folders.values():
+        read, most = None, max(1, int(_FEW * len(rows)))
+        with suppress(SceneError):  # names that do not tell
+            read = read_names([names[i] for i in rows], "")
+        if read is None or len(rows) < _LEAST_FRAMES:
+            continue
+        order = sorted(range(len(rows)), key=lambda k: (read.frames[k], times[rows[k]]))
+        rows = [rows[k] for k in order]
+        odd = sorted({*rows} - {*_longest_ascent(rows, times)}, key=rows.index)
+        if 0 < len(odd) <= most:
+            said = f"time {times[odd[0]]:.10g} of {names[odd[0]]} is out of the order of the images' names"
+            return f"{said}; mend it, if it is wrong"
+        time, count = Counter(times[i] for i in rows).most_common(1)[0]
+        is_film = len({*read.frames}) == len(rows) and 1 < count < len(rows)
+        if is_film and (count >= len(rows) - most or len(rows) - len({times[i] for i in rows}) <= most):
+            some = ", ".join([names[i] for i in rows if times[i] == time][:2])
+            said = f"{count} of {len(rows)} images have one time, {time:.10g} ({some}, ..)"
+            return f"{said}; mend it, if it is wrong"
+    return ""
+
+
+def _longest_ascent(rows: Sequence[int], times: Sequence[float]) -> list[int]:
+    """Return the most of the rows, in order, whose times never fall."""
+    ends, last, before = [], [], {}
+    for row in rows:
+        at = bisect_right(ends, times[row])
+        ends[at:], last[at:] = [times[row], *ends[at + 1 :]], [row, *last[at + 1 :]]
+        before[row] = last[at - 1] if at else None
+    chain, row = [], last[-1]
+    while row is not None:
+        chain.append(row)
+        row = before[row]
+    return chain[::-1]
 
 
 def _views_of(cameras: Sequence[Camera]) -> list[list[float]]:
@@ -583,6 +635,14 @@ def check_times(
         return len({*some}) > 2 and max(some) - min(some) < least * whole
 
     refuse_far(named, where, "time", advice)
+    for highest in (1 + _ROUNDING, math.inf):  # -1 that stands for none, or 20 among shares
+        rest = [time for time in times if -_ROUNDING <= time <= highest]
+        away = {name: max(rest[0] - t, t - rest[-1]) for name, t in named.items()} if len(rest) > 2 else {}
+        odd = [name for name, distance in away.items() if distance > 0]
+        name = max(odd, key=away.get, default="")
+        if 0 < len(odd) <= max(1, _FEW * len(named)) and away[name] > _APART * np.diff(rest).max():
+            expected = f"a time near all others, {rest[0]:.10g} to {rest[-1]:.10g}"
+            raise mismatch(f"{where}: time of {name}", expected, f"{named[name]:.10g}", advice)
     for split, of in splits.items():
         some = of.values()
         in_unit = _within_unit(some)
