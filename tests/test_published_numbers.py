@@ -197,7 +197,7 @@ def test_faults_of_the_released_code_are_on_in_faithful_and_off_in_fast(model):
 
 # The paper's method by the place where it is printed: sections 3 and 4, and appendices A.2, A.4 and A.5.
 WEIGHTS_FORWARD = {"photo": 1, "flow_l1": 1e-5, "tv_density": 1e-6, "tv_flow": 1e-3, "tv_depth": 1e-1}
-NONE_PRINTED = {"static_points": 0, "moving_opacity": 0}
+NONE_PRINTED = {"static_points": 0, "moving_opacity": 0, "rigid": 0}
 ENTROPIES = {"coarse": {"point_color": 1e-1, "background_entropy": 1e-2, "inpaint_diff": 0}}
 ENTROPIES["fine"] = {"point_color": 1e-2, "background_entropy": 1e-3, "inpaint_diff": 1e-5}
 RATES = {"grid": 1e-1, "network": 1e-3, "flow": 1e-3} | dict.fromkeys(("density", "color", "shading"), 1e-1)
@@ -213,7 +213,7 @@ FORWARD = {
         f"objective.{stage}.weights": WEIGHTS_FORWARD | NONE_PRINTED | own for stage, own in ENTROPIES.items()
     },
     "A.4 opacity at first": under("stage.coarse", start_alpha=1e-6, box_alpha=1e-3)
-    | fine(start_alpha=1e-2, carry=False),
+    | fine(start_alpha=1e-2, carry="motion"),
     "A.4 ten images, and one more every 60": under("stage.fine.curriculum", start=10, iterations_per_time=60)
     | under("stage.coarse.curriculum", iterations_per_time=60),
     "A.5 sizes, steps and rates": under("stage.coarse", num_voxels=[[0, 67**3]], upsample=1.5, share=20)

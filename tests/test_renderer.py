@@ -186,6 +186,24 @@ def test_without_gradient_the_kernel_draws_the_same(monkeypatch, strength, thres
 
 
 @pytest.mark.skipif(importlib.util.find_spec("numba") is None, reason="Numba is not installed")
+@pytest.mark.parametrize("strength", [0.3, 3.0, 100.0])
+def test_a_pass_without_gradient_first_leaves_out_what_hardly_counts(strength):
+    grid, view = blocks((9, 14, 12), strength)
+    behind, weight, shading = torch.rand(len(view), 3), torch.rand(len(view), 3), SphericalHarmonics()
+    drawn = []
+    for renderer in (Renderer(), Renderer(trace_first=True)):
+        values = grid.values.clone().requires_grad_()
+        seen = renderer(replace(grid, values=values), view, behind, shading)
+        (seen.rgb * weight).sum().backward()
+        drawn.append((seen, values.grad))
+    (whole, expected), (some, found) = drawn
+    torch.testing.assert_close(some.rgb, whole.rgb, atol=3e-3, rtol=0)
+    assert (found - expected).norm() < 0.01 * expected.norm()
+    assert some.samples < 0.7 * whole.samples or strength < 100
+    assert len(some.weights) < whole.samples
+
+
+@pytest.mark.skipif(importlib.util.find_spec("numba") is None, reason="Numba is not installed")
 def test_the_kernel_serves_only_where_nothing_else_is_asked_for(monkeypatch):
     asked = []
     monkeypatch.setattr("forewarp.renderer.trace", lambda *a, **k: asked.append(1) or trace(*a, **k))

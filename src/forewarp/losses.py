@@ -12,15 +12,21 @@ from torch import Tensor
 from forewarp.ops.grid import patch_variation, total_variation
 
 
-def photometric(rgb: Tensor, truth: Tensor, *, literal: bool = False) -> Tensor:
+def mean_over_rays(values: Tensor, shares: Tensor | None) -> Tensor:
+    """Mean of values (R,) of rays, each counted ``shares`` (R,) times; None: each once."""
+    return values.mean() if shares is None else (values * shares).mean()
+
+
+def photometric(rgb: Tensor, truth: Tensor, *, literal: bool = False, shares: Tensor | None = None) -> Tensor:
     """Squared error of the colours (R, 3), mean over rays and channels; literal: summed over channels."""
     error = (rgb - truth).square()
-    return error.sum(-1).mean() if literal else error.mean()
+    return mean_over_rays(error.sum(-1) if literal else error.mean(-1), shares)
 
 
 def point_color(
-    weights: Tensor, colors: Tensor, ray_ids: Tensor, truth: Tensor, *, all_ray_ids: Tensor | None = None
-) -> Tensor:
+    weights: Tensor, colors: Tensor, ray_ids: Tensor, truth: Tensor, *, all_ray_ids: Tensor | None = None,
+    shares: Tensor | None = None,
+) -> Tensor:  # fmt: skip
     """w1: ``sum_k w_k ||c_k - truth||^2`` over the samples of a ray, mean over rays.
 
     Args:
@@ -30,17 +36,20 @@ def point_color(
         truth: (R, 3).
         all_ray_ids: (P,) int64, the rays of all samples, including those too faint to have a colour: divide
             by a ray's number of samples, as printed. None: do not divide.
+        shares: as of ``mean_over_rays``.
     """
     per_sample = weights.detach() * (colors - truth[ray_ids]).square().sum(-1)
     if all_ray_ids is not None:
         per_sample = per_sample / torch.bincount(all_ray_ids, minlength=len(truth))[ray_ids]
+    if shares is not None:
+        per_sample = per_sample * shares[ray_ids]
     return per_sample.sum() / max(len(truth), 1)
 
 
-def background_entropy(transmittance: Tensor) -> Tensor:
+def background_entropy(transmittance: Tensor, shares: Tensor | None = None) -> Tensor:
     """w2: mean binary entropy of the rays' final transmittance (R,), clamped to have a finite slope."""
     t = transmittance.clamp(1e-6, 1 - 1e-6)
-    return -(t * torch.log(t) + (1 - t) * torch.log1p(-t)).mean()
+    return mean_over_rays(-(t * torch.log(t) + (1 - t) * torch.log1p(-t)), shares)
 
 
 def sample_entropy(weights: Tensor) -> Tensor:
@@ -66,6 +75,24 @@ def tv_density(raw_density: Tensor, pairs: list[tuple[Tensor, Tensor]]) -> Tenso
 def tv_flow(flow: Tensor, pairs: list[tuple[Tensor, Tensor]]) -> Tensor:
     """w6: total variation of the flow (N, 3) over pairs of neighbouring voxels."""
     return total_variation(flow, pairs)
+
+
+def strain(flow: Tensor, corners: Tensor, spacing: Tensor) -> Tensor:
+    """Mean square of Green's strain ``F^T F - 1`` of a flow, which is 0 where it moves matter rigidly.
+
+    ``F = 1 + J``, J the flow's slopes by forward differences; all is summed over the nine entries.
+
+    Args:
+        flow: (M, 3), world units.
+        corners: (E, 4) int64, rows of a place and of its neighbours along x, y and z: ``cell_corners``.
+        spacing: (3,), distance to these neighbours, world units.
+    """
+    if not len(corners):
+        return flow.sum() * 0.0
+    here, *others = (flow.index_select(0, rows) for rows in corners.unbind(-1))
+    slopes = torch.stack([(there - here) / step for there, step in zip(others, spacing)], -1)  # (E, 3, 3)
+    turned = slopes.transpose(1, 2)
+    return (slopes + turned + turned @ slopes).square().sum((1, 2)).mean()
 
 
 def tv_depth(depth: Tensor, opacity: Tensor) -> Tensor:

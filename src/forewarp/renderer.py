@@ -12,6 +12,7 @@ from torch import Tensor
 from forewarp.fields.grids import EMPTY, FieldAtTime, RadianceGrid, Shade
 from forewarp.ops.backend import use_numba
 from forewarp.ops.march import (
+    Traced,
     accumulate,
     by_importance,
     clip_to_box,
@@ -79,11 +80,14 @@ class Renderer:
         color_threshold: compute no colour for samples of less weight; 0: compute all.
         early_stop_eps: end a ray once its transmittance is below this, in images (rendered without gradient
             by the CPU kernel); 0: never.
+        trace_first: in training on the CPU, too, a pass without gradient ends rays so, and leaves samples
+            fainter than ``color_threshold`` out of the other, which has the gradient.
     """
 
     step: float = 0.5
     color_threshold: float = 1e-4
     early_stop_eps: float = 1e-4
+    trace_first: bool = False
 
     def __post_init__(self) -> None:
         if not self.step > 0 or not 0 <= self.color_threshold < 1 or not 0 <= self.early_stop_eps < 1:
@@ -118,18 +122,28 @@ class Renderer:
             colour, depth and opacity, differentiable in the field, with the samples. Depth is the mean
             distance of what is met, 0 where nothing is.
         """
-        plain = type(field) is RadianceGrid and not keep_all_weights and not torch.is_grad_enabled()
-        if plain and use_numba(field.values):
+        plain = type(field) is RadianceGrid and not keep_all_weights and use_numba(field.values)
+        if plain and not torch.is_grad_enabled():
             return self._traced(field, rays, background, shade, generator)
         count, step = len(rays), self.step * field.voxel_size
-        origins, directions, jitter = self._starts(field, rays, generator)
-        ray_ids, distances = march(origins, directions, rays.near, rays.far, step, field.cells, jitter)
+        origins, directions, jitter = starts = self._starts(field, rays, generator)
+        traced = plain and self.trace_first and self.color_threshold > 0
+        if traced:
+            found = self._trace(field, rays, *starts)
+            ray_ids, distances, samples = found.ray_ids, found.distances, found.samples
+        else:
+            ray_ids, distances = march(origins, directions, rays.near, rays.far, step, field.cells, jitter)
+            samples = len(ray_ids)
         points = origins[ray_ids] + distances[:, None] * directions[ray_ids]
-        at_once = hasattr(field, "look_up")
-        density, color_of = field.look_up(points) if at_once else (field.density(points), None)
+        if traced:
+            density, color_of = field.read(points, shade)
+        elif hasattr(field, "look_up"):
+            density, color_of = field.look_up(points)
+        else:
+            density, color_of = field.density(points), None
         weights, transmittance = render_weights(density * step, ray_ids, count)
         kept = slice(None)
-        if self.color_threshold > 0:
+        if self.color_threshold > 0 and not traced:
             kept = (weights.detach() > self.color_threshold).nonzero()[:, 0]
         some_weights, some_rays = weights[kept], ray_ids[kept]
         towards = rays.directions[some_rays]
@@ -142,18 +156,12 @@ class Renderer:
         depth = depth / opacity.clamp(min=1e-6)
         every = (weights, ray_ids) if keep_all_weights else (None, None)
         found = rgb, depth, opacity, transmittance, some_weights, colors, some_rays
-        return Marched(*found, len(ray_ids), *every)
+        return Marched(*found, samples, *every)
 
     def _traced(self, grid: RadianceGrid, rays: Rays, background: Tensor, shade, generator) -> Marched:
         """Render without gradient by one kernel, equal within ``early_stop_eps``: skip what is hidden."""
-        step, activation = self.step * grid.voxel_size, grid.activation
         origins, directions, jitter = self._starts(grid, rays, generator)
-        found = trace(
-            origins, directions, rays.near, rays.far, step, grid.cells, jitter,
-            raw=grid.raw_density, index=grid.index, fill=EMPTY, shift=activation.shift,
-            scale=step / activation.density_scale, early_stop_eps=self.early_stop_eps,
-            threshold=self.color_threshold or -1.0,  # 0 keeps all samples, even those of weight 0
-        )  # fmt: skip
+        found = self._trace(grid, rays, origins, directions, jitter)
         ray_ids, weights = found.ray_ids, found.weights
         points = origins[ray_ids] + found.distances[:, None] * directions[ray_ids]
         colors = grid.colors(points, rays.directions[ray_ids], shade)
@@ -161,6 +169,18 @@ class Renderer:
         rgb = accumulate(weights, colors, ray_ids, len(rays)) + through[:, None] * background
         depth = found.distance / opacity.clamp(min=1e-6)
         return Marched(rgb, depth, opacity, through, weights, colors, ray_ids, found.samples)
+
+    def _trace(
+        self, grid: RadianceGrid, rays: Rays, origins: Tensor, directions: Tensor, jitter: Tensor
+    ) -> Traced:
+        """Find, without gradient, the samples that are neither hidden nor faint."""
+        step, activation = self.step * grid.voxel_size, grid.activation
+        return trace(
+            origins, directions, rays.near, rays.far, step, grid.cells, jitter,
+            raw=grid.raw_density.detach(), index=grid.index, fill=EMPTY, shift=activation.shift,
+            scale=step / activation.density_scale, early_stop_eps=self.early_stop_eps,
+            threshold=self.color_threshold or -1.0,  # 0 keeps all samples, even those of weight 0
+        )  # fmt: skip
 
     def image(
         self, field: FieldAtTime, rays: Rays, background: Tensor, shade: Shade | None = None

@@ -13,7 +13,9 @@ import yaml
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from forewarp import load
+from forewarp.fields.curves import TrajectoryField
 from forewarp.methods.particles.model import Particles
+from forewarp.methods.voxel.forward import ForwardWarp
 from forewarp.runs.session import locked
 from forewarp.training.checkpoints import load_handover
 from tests.support.commands import TINY
@@ -301,6 +303,20 @@ def test_particles_begin_where_voxels_found_matter(ok, refused, scenes, in_tmp, 
     assert isinstance(load(in_tmp / "run").method, Particles)
     line = refused(*words, "preset.rays=64", "model/radiance=mlp")
     assert "model/radiance: expected an option of model=particles" in line  # of the run as ever
+
+
+@pytest.mark.slow
+def test_voxels_begin_with_the_motion_of_particles(ok, scenes, in_tmp, monkeypatch):
+    took, fit = [], TrajectoryField.fit
+    monkeypatch.setattr(TrajectoryField, "fit", lambda own, *known: took.append(known[0]) or fit(own, *known))
+    words = ["train", "model=forward", "start_motion=particles", "data=dnerf", f"data.root={scenes}"]
+    words += ["data.scene=vehicle", "trainer=cpu", "threads=1", "logger=none", "run=run", "sheets=0"]
+    words += ["evaluate=false", "stage.fine.num_voxels=[[0,800]]", "preset.nodes=12", "preset.rays=64"]
+    ok(*words, "budget.minutes=null", "budget.iterations=6")
+    assert [type(paths.__self__) for paths in took] == [Particles]
+    method = load(in_tmp / "run").method
+    assert isinstance(method, ForwardWarp)
+    assert method.motion.trajectory.learned.lattice == method.motion.trajectory.lattice
 
 
 @pytest.mark.slow

@@ -63,6 +63,36 @@ def test_all_pixels_and_frames_are_drawn(scene):
     assert torch.equal(torch.get_rng_state(), before)  # the global generator plays no part
 
 
+def dot(scene):
+    """The scene with images of 50x50 pixels, each of which shows 5x5."""
+    rgba = torch.zeros(50, 50, 4, dtype=torch.uint8)
+    rgba[20:25, 30:35] = 255
+    cameras = [replace(frame.camera, width=50, height=50) for frame in scene.train]
+    frames = [replace(f, camera=c, load=lambda: rgba) for f, c in zip(scene.train, cameras)]
+    return replace(scene, train=tuple(frames), has_alpha=True), rgba[..., 3].flatten() > 0
+
+
+def test_rays_near_matter_are_drawn_more_often_and_count_less(scene):
+    shown, matter = dot(scene)
+    draw = Sampler(shown, rays=1000, asks=Asks(near=0.8), views_per_step=1).draw
+    found = [draw().observations[0] for _ in range(30)]
+    pixels, shares = (torch.cat(part) for part in zip(*((o.view.pixels, o.shares) for o in found)))
+    near = shares < 1
+    assert near.float().mean().item() == pytest.approx(0.8 + 0.2 * 49 / 2500, abs=0.01)
+    assert set(matter.nonzero()[:, 0].tolist()) <= set(pixels[near].tolist())
+    assert len(pixels.unique()) > 2000
+    for of in (torch.ones(2500), matter.float(), torch.arange(2500) / 2500):  # any mean over the image is met
+        assert (of[pixels] * shares).mean().item() == pytest.approx(of.mean().item(), rel=0.05)
+
+
+def test_rays_count_alike_where_none_is_preferred(scene):
+    shown, _ = dot(scene)
+    opaque = replace(shown, has_alpha=False)
+    for sampler in (Sampler(shown, rays=9), Sampler(opaque, rays=9, asks=Asks(near=0.5))):
+        assert sampler.draw().shares() is None
+    assert len(Sampler(shown, rays=9, asks=Asks(near=0.5), views_per_step=2).draw().shares()) == 9
+
+
 def test_the_picker_chooses_the_frame(scene):
     batches, order = Sampler(scene, rays=9), iter([2, 0, 3])
     batches.picker = lambda: next(order)

@@ -3,6 +3,7 @@
 import pytest
 import torch
 
+from forewarp import losses
 from forewarp.fields.curves import Curve, TrajectoryField
 from forewarp.fields.grids import VoxelGrid
 from forewarp.scene.box import Box, Lattice
@@ -101,3 +102,72 @@ def test_curves_of_few_numbers():
     for few in (2, 3, 4):  # as free as there are times
         curve = Curve("spline", 4, few, 0.0, straight=True)
         assert torch.linalg.matrix_rank(curve(torch.linspace(0, 1, few))) == few == curve.count
+
+
+def learned(**changes):
+    return TrajectoryField(BOX, bases=3, frames=8, canonical_time=0.3, kind="nodes", **{"nodes": 8} | changes)
+
+
+def swirl(points, times):
+    """Paths that every lattice reads exactly: linear in place, cosines of the basis in time."""
+    turn = torch.tensor([[0.0, -0.3, 0.1], [0.2, 0.1, 0.0], [0.0, 0.4, -0.2]])
+    basis = learned().basis(times)
+    return points[:, None] + (points @ turn.T + 0.1)[:, None] * (basis[:, :1] - 0.5 * basis[:, 2:])
+
+
+def test_learned_nodes_begin_with_known_paths_and_interpolate_them():
+    moving, grid, times = learned(), voxels(), torch.tensor([0.0, 0.3, 0.65, 1.0])
+    moving.follow(grid)
+    moving.fit(swirl, torch.linspace(0, 1, 8).tolist())
+    home = LATTICE.to_world(grid.voxels)
+    torch.testing.assert_close(moving.trajectories(home, times), swirl(home, times), atol=1e-4, rtol=1e-4)
+    for i, time in enumerate(times.tolist()):
+        went = moving.trajectories(home, times)[:, i] - home
+        torch.testing.assert_close(moving.flow(grid, time), went, atol=1e-5, rtol=1e-4)
+
+
+def test_learned_nodes_are_kept_around_active_voxels_and_new_ones_begin_as_their_neighbours():
+    moving, grid = learned(), voxels(slice(2))
+    before, after, rows = moving.follow(grid)
+    count = len(moving.learned.voxels)
+    assert len(before[0]) == moving.lattice.count > count == len(after[0]) == len(rows)
+    assert moving.follow(grid) is None
+    torch.nn.init.constant_(moving.learned.coefficients, 0.25)
+    everywhere = torch.ones(LATTICE.shape, dtype=torch.bool)
+    everywhere[3:] = False  # one voxel farther, which is about one node
+    grid.activate(everywhere, {})
+    _, after, rows = moving.follow(grid)
+    assert (rows < 0).any()
+    assert len(after[0]) > count
+    assert (after[0] == 0.25).all()
+
+
+def test_nodes_are_as_far_apart_in_a_smaller_box():
+    small = Lattice(Box((-0.5, -0.75, -1), (0.5, 0.75, 1)), (5, 5, 5))
+    whole, part = learned(nodes=20), learned(nodes=20, voxels=small)
+    assert part.lattice.box == small.box
+    assert part.lattice.voxel_size == pytest.approx(whole.lattice.voxel_size, rel=0.1)
+
+
+@pytest.mark.parametrize(
+    ("changes", "text"),
+    [
+        ({"kind": "grid"}, r"^model.trajectory.kind: expected network or nodes, but got 'grid'"),
+        ({"kind": "nodes", "nodes": 0}, r"^model.trajectory.nodes: expected a number > 0 of nodes, but"),
+    ],
+)
+def test_refuses_coefficients_of_nothing(changes, text):
+    with pytest.raises(ValueError, match=text):
+        TrajectoryField(BOX, bases=3, frames=8, canonical_time=0.3, **changes)
+
+
+@pytest.mark.parametrize("changes", [{"nodes": 8}, {"nodes": 0}, {"kind": "nodes", "nodes": 8}])
+def test_what_is_measured_for_strain_is_the_flow(changes):
+    moving, grid = TrajectoryField(BOX, bases=3, frames=8, canonical_time=0.3, **changes), voxels()
+    for parameter in moving.parameters():
+        torch.nn.init.normal_(parameter, std=0.1)
+    flow, corners, spacing = moving.beside(grid, 0.9)
+    assert len(flow) > int(corners.max())
+    lattice = moving.lattice if moving.at_nodes else LATTICE
+    torch.testing.assert_close(spacing, torch.tensor(lattice.spacing))
+    assert losses.strain(flow, corners, spacing) > 0

@@ -6,12 +6,14 @@ import shutil
 import signal
 import sys
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import lightning
 import pytest
 import torch
 
+from forewarp.fields.curves import TrajectoryField
 from forewarp.interrupts import ENDING, signal_of
 from forewarp.training import stages as stages_module
 from forewarp.training.checkpoints import KeepCheckpoint
@@ -31,10 +33,12 @@ def stages(**changes):
     return [coarse, tiny.stage("fine", num_voxels=[[0, 11**3], [0.5, 14**3]], **(common | changes))]
 
 
-def run(folder, callbacks=(), plan=None, **changes):
+def run(folder, callbacks=(), plan=None, model=None, **changes):
     """A run of the stages of ``plan``, or of ``stages(**changes)``, over small images."""
     plan = stages(**changes) if plan is None else plan
-    return tiny.make_run(folder, plan, data=tiny.ball_data(rays=64, size=16), callbacks=callbacks)
+    return tiny.make_run(
+        folder, plan, data=tiny.ball_data(rays=64, size=16), model=model, callbacks=callbacks
+    )
 
 
 @pytest.fixture(scope="module")
@@ -59,6 +63,24 @@ def test_a_continued_run_equals_an_uninterrupted_one_to_the_bit(tmp_path, whole)
         with pytest.raises(SystemExit):
             run(tmp_path, [interruption]).fit()
     assert tiny.same(run(tmp_path).fit(), whole[1])
+
+
+def test_a_run_with_learned_nodes_and_rays_near_matter_continues_to_the_bit(tmp_path):
+    nodes = tiny.forward_model(trajectory=partial(TrajectoryField, bases=4, nodes=16, kind="nodes"))
+    for carry in ("all", "motion"):
+        options = {
+            "model": nodes,
+            "near_share": 0.7,
+            "carry": carry,
+            "weights": {"photo": 1.0, "rigid": 1e-2},
+        }
+        straight = run(tmp_path / carry, **options).fit()
+        counts = straight.method.motion.trajectory.learned
+        assert 0 < len(counts.voxels) < counts.lattice.count
+        for interruption in (Crash(), tiny.Interrupt("fine", 3), tiny.Interrupt("fine", 7)):
+            with pytest.raises(SystemExit):
+                run(tmp_path / f"{carry} in parts", [interruption], **options).fit()
+        assert tiny.same(run(tmp_path / f"{carry} in parts", **options).fit(), straight)
 
 
 def test_a_finished_run_is_loaded_and_one_that_was_not_noted_only_noted(tmp_path, whole):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -11,10 +12,11 @@ from torch.utils.data import IterableDataset
 
 from forewarp.data.files import mismatch, one_of
 from forewarp.data.images import StoredImage, composited, reduced
-from forewarp.ops.grid import block_means, reduced_depth
+from forewarp.ops.grid import block_means, dilate, reduced_depth
 from forewarp.scene.frame import Frame, Scene, instants_of
 from forewarp.scene.view import Asks, Batch, Moment, Observation, Target, View
 
+_BESIDE = 0.02  # of an image's width: so far from what it shows is still near it
 COLORS = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}
 
 
@@ -70,6 +72,7 @@ class Sampler(IterableDataset):
         self.frames, self.background, self.picker, self.asks = scene.train, background, picker, asks or Asks()
         self.rays = None if rays is None else int(rays)
         self.views_per_step = min(int(views_per_step), self.rays or 1)
+        self.has_alpha, self._places = scene.has_alpha, {}  # the latter: frame -> (H W,) bool, see _near
         self._times, self._of_time = instants_of(scene.train), {}  # the latter: time -> frames
         for index, time in enumerate(self._times):
             self._of_time.setdefault(time, []).append(index)
@@ -128,10 +131,35 @@ class Sampler(IterableDataset):
             allowed = None if frame.load_valid is None else frame.load_valid().flatten().nonzero()[:, 0]
             most = frame.camera.width * frame.camera.height if allowed is None else len(allowed)
             pixels = torch.randint(most, (count,), generator=self._generator)
-            views.append(View(frame.camera, pixels if allowed is None else allowed[pixels]))
+            shares = None
+            if self.asks.near > 0 and self.has_alpha and allowed is None:
+                pixels, shares = self._near(index, pixels)
+            views.append((View(frame.camera, pixels if allowed is None else allowed[pixels]), shares))
         colors = self._colors(self.rays).split(counts) if self.background == "random" else None
-        for i, (index, view) in enumerate(zip(frames, views)):
-            yield self._observed(index, view, color_of(self.background) if colors is None else colors[i])
+        for i, (index, (view, shares)) in enumerate(zip(frames, views)):
+            background = color_of(self.background) if colors is None else colors[i]
+            yield replace(self._observed(index, view, background), shares=shares)
+
+    def _near(self, index: int, pixels: Tensor) -> tuple[Tensor, Tensor | None]:
+        """Replace a share of uniformly drawn pixels (R,) by some near what frame ``index`` shows.
+
+        Returns:
+            pixels (R,), and one over how much more often than uniformly each of them is drawn, (R,).
+        """
+        if index not in self._places:
+            rgba = pixels_of(self.frames[index])
+            grown = dilate(rgba[..., 3] > 0, max(1, round(_BESIDE * rgba.shape[1])))
+            self._places[index] = grown.flatten()
+        mask = self._places[index]
+        places = mask.nonzero()[:, 0]
+        if not len(places):
+            return pixels, torch.ones(len(pixels))
+        share = self.asks.near
+        drawn = torch.randint(len(places), (round(share * len(pixels)),), generator=self._generator)
+        pixels = torch.cat([places[drawn], pixels[len(drawn) :]])
+        more = len(drawn) / len(pixels)
+        often = (1 - more) + more * mask[pixels] * (len(mask) / len(places))
+        return pixels, 1 / often
 
     def _areas(self, frames: list[int]) -> Iterator[Observation]:
         """Draw a crop or the whole of each frame, over one colour."""

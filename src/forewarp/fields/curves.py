@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Sequence
 from operator import mul
 
 import torch
@@ -10,12 +11,14 @@ from torch import Tensor, nn
 
 from forewarp.fields.grids import VoxelGrid
 from forewarp.fields.networks import mlp
+from forewarp.ops.backend import check_value
 from forewarp.ops.curves import dct_basis, spline_basis, spline_shares
 from forewarp.ops.encode import positional_encoding
-from forewarp.ops.grid import corner_weights, index_of, trilinear
+from forewarp.ops.grid import cell_corners, corner_weights, index_of, trilinear
 from forewarp.scene.box import Box, Lattice
 
 KINDS = ("spline", "cosines")
+COEFFICIENTS = ("network", "nodes")
 PADDING = 0.2  # of the sequence, imagined before and after it: a cosine stands still at both ends
 
 
@@ -83,10 +86,12 @@ class Curve:
 
 
 class TrajectoryField(nn.Module):
-    """The paper's F2: encoded position (and grid features) -> DCT coefficients (N, 3, K) of the flow.
+    """DCT coefficients (N, 3, K) of the flow of every voxel: the paper's F2, or learned at nodes.
 
-    Coefficients are evaluated at the nodes of a coarse lattice and interpolated to the voxels, which also
-    smooths the motion. With ``nodes=0`` they are evaluated at every voxel, as in the paper. Bases beyond
+    F2 is a network: encoded position (and grid features) -> coefficients. They may be evaluated at the nodes
+    of a coarse lattice and interpolated to the voxels, which also smooths the motion; with ``nodes=0`` they
+    are evaluated at every voxel, as in the paper. Without a network (``kind="nodes"``) they are learned at
+    these nodes themselves, of which those around the active voxels are kept (``follow``). Bases beyond
     ``bases_in_play`` are 0.
 
     Args:
@@ -94,12 +99,16 @@ class TrajectoryField(nn.Module):
         bases: K, reduced to ``frames - 1`` if larger.
         frames: T, the number of distinct training times, at least 2.
         canonical_time: time at which flow is exactly 0.
+        kind: of ``COEFFICIENTS``.
         nodes: number of nodes along the box's mean side, at least 8; 0: no nodes.
         features: channels of the deformation feature grid, at the nodes or, without nodes, at ``voxels``; 0:
             none.
         voxels: lattice of the canonical voxels; None: that of the nodes.
         width, layers, frequencies: size of F2, octaves of the positional encoding.
         padding: lets objects move at the first and last frame (see ``dct_basis``).
+
+    Raises:
+        ValueError: for another kind, or learned nodes of which there are none.
     """
 
     def __init__(
@@ -109,6 +118,7 @@ class TrajectoryField(nn.Module):
         bases: int,
         frames: int,
         canonical_time: float,
+        kind: str = "network",
         nodes: int = 0,
         features: int = 0,
         voxels: Lattice | None = None,
@@ -118,22 +128,35 @@ class TrajectoryField(nn.Module):
         padding: float = 0.0,
     ) -> None:
         super().__init__()
+        check_value("model.trajectory.kind", kind, "network or nodes", lambda kind: kind in COEFFICIENTS)
         self.box, self.frames, self.canonical_time = box, frames, canonical_time
         self.bases = min(bases, frames - 1)
         self.scale = 0.5 * max(box.size)
         self.lattice = Lattice.of_count(box, max(nodes, 8) ** 3)
         self.at_nodes = nodes > 0
-        self.features = None
-        if features:
-            places = self.lattice if self.at_nodes or voxels is None else voxels
-            everywhere = torch.ones(places.shape, dtype=torch.bool)
-            self.features = VoxelGrid(places, everywhere, {"grid": features})
         self.frequencies, self.padding = frequencies, padding
-        inputs = 3 * (1 + 2 * frequencies) + features
-        self.network = mlp(inputs, 3 * self.bases, width=width, layers=layers, zero_last=True, leaky=True)
+        self.features = self.network = self.learned = None
+        if kind == "nodes":
+            other = "set preset.nodes=48, or model.trajectory.kind=network"
+            check_value("model.trajectory.nodes", nodes, "a number > 0 of nodes", lambda n: n > 0, other)
+            if voxels is not None:  # as far apart, but in the voxels' box alone
+                share = math.prod(voxels.box.size) / math.prod(box.size)
+                self.lattice = Lattice.of_count(voxels.box, max(nodes, 8) ** 3 * share)
+            everywhere = torch.ones(self.lattice.shape, dtype=torch.bool)
+            self.learned = VoxelGrid(self.lattice, everywhere, {"coefficients": 3 * self.bases})
+        else:
+            if features:
+                places = self.lattice if self.at_nodes or voxels is None else voxels
+                everywhere = torch.ones(places.shape, dtype=torch.bool)
+                self.features = VoxelGrid(places, everywhere, {"grid": features})
+            inputs = 3 * (1 + 2 * frequencies) + features
+            layout = {"width": width, "layers": layers, "zero_last": True, "leaky": True}
+            self.network = mlp(inputs, 3 * self.bases, **layout)
         self.register_buffer("bases_in_play", torch.tensor(self.bases))
         # Of the grid that was asked for last: its voxels, their places, and the nodes around them.
         self._nodes: tuple[Tensor, Tensor, tuple[Tensor, Tensor, Tensor]] | None = None
+        self._followed: Tensor | None = None  # the voxels that the learned nodes are around
+        self._corners: tuple[Tensor, Tensor] | None = None  # see beside
 
     def play(self, bases: float | None) -> int:
         """Use the first ``bases`` bases, all for None; return their number."""
@@ -142,8 +165,17 @@ class TrajectoryField(nn.Module):
         return playing
 
     def coefficients(self, points: Tensor) -> Tensor:
-        """Return the DCT coefficients (N, 3, K) at points (N, 3), in world units."""
+        """Return the DCT coefficients (N, 3, K) at points (N, 3), in world units.
+
+        Learned ones are interpolated; a node that is not kept counts as the mean of those that are.
+        """
         coordinates = self.lattice.to_lattice(points)
+        if self.learned is not None:
+            values, index = self.learned.coefficients, self.learned.index
+            read = trilinear(values, index, coordinates, values.new_zeros(values.shape[1]))
+            ones = values.new_ones(len(values), 1)
+            share = trilinear(ones, index, coordinates, ones.new_zeros(1))
+            return self.scale * (read / share.clamp(min=1e-6)).reshape(-1, 3, self.bases)
         inputs = positional_encoding(self.lattice.normalised(coordinates), self.frequencies)
         if self.features is not None:
             inputs = torch.cat([inputs, self.features.read("grid", points)], -1)
@@ -160,14 +192,40 @@ class TrajectoryField(nn.Module):
 
         Cost: F2 on the nodes around the active voxels, then one trilinear read per voxel.
         """
+        points, (nodes, index, coordinates) = self._around(grid)
+        if not self.at_nodes:
+            return _matmul(self.coefficients(points), self.basis(time))
+        at_nodes, index = self._at_nodes(nodes, index, time)
+        return trilinear(at_nodes, index, coordinates, at_nodes.new_zeros(3))
+
+    def beside(self, grid: VoxelGrid, time: float) -> tuple[Tensor, Tensor, Tensor]:
+        """Return what ``losses.strain`` asks of the motion of a grid's voxels at a time: the flow (M, 3) at
+        the nodes, without nodes at the voxels; rows (E, 4) of neighbours; and their distances (3,).
+
+        Cost: that of ``flow``.
+        """
+        if self.at_nodes:
+            _, (nodes, index, _) = self._around(grid)
+            (flow, index), lattice = self._at_nodes(nodes, index, time), self.lattice
+        else:
+            flow, index, lattice = self.flow(grid, time), grid.index, grid.lattice
+        if self._corners is None or self._corners[0] is not index:
+            self._corners = index, cell_corners(index)
+        return flow, self._corners[1], flow.new_tensor(lattice.spacing)
+
+    def _at_nodes(self, nodes: Tensor, index: Tensor, time: float) -> tuple[Tensor, Tensor]:
+        """Return the flow (M, 3) at nodes (M, 3) at a time, and which row is whose: of learned ones, all."""
+        if self.learned is None:
+            return _matmul(self.coefficients(nodes), self.basis(time)), index
+        own = self.scale * self.learned.coefficients.reshape(-1, 3, self.bases)
+        return _matmul(own, self.basis(time)), self.learned.index
+
+    def _around(self, grid: VoxelGrid) -> tuple[Tensor, tuple[Tensor, Tensor, Tensor]]:
+        """Return the places (N, 3) of a grid's active voxels, and ``_nodes_around`` of them."""
         if self._nodes is None or self._nodes[0] is not grid.voxels:
             points = grid.lattice.to_world(grid.voxels)
             self._nodes = grid.voxels, points, self._nodes_around(points)
-        _, points, (nodes, index, coordinates) = self._nodes
-        at_nodes = _matmul(self.coefficients(nodes if self.at_nodes else points), self.basis(time))
-        if not self.at_nodes:
-            return at_nodes
-        return trilinear(at_nodes, index, coordinates, at_nodes.new_zeros(3))
+        return self._nodes[1:]
 
     def _nodes_around(self, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         coordinates = self.lattice.to_lattice(points)
@@ -177,9 +235,42 @@ class TrajectoryField(nn.Module):
         nodes = mask.nonzero()
         return self.lattice.to_world(nodes), index_of(nodes, self.lattice.shape), coordinates
 
+    def follow(self, grid: VoxelGrid) -> tuple[list[nn.Parameter], list[nn.Parameter], Tensor] | None:
+        """Keep the learned nodes around a grid's active voxels; new ones begin as their neighbours' mean.
+
+        Returns:
+            parameters before and after, and the former row of each row; None if nothing changed.
+        """
+        if self.learned is None or self._followed is grid.voxels:
+            return None
+        self._followed = grid.voxels
+        active = self._around(grid)[1][1] >= 0
+        if torch.equal(active, self.learned.index >= 0):
+            return None
+        before = self.learned.rows()
+        rows = self.learned.activate(active, {})
+        return before, self.learned.rows(), rows
+
+    @torch.no_grad()
+    def fit(self, paths: Callable[[Tensor, Tensor], Tensor], times: Sequence[float]) -> None:
+        """Begin the learned nodes with the coefficients that come nearest to known paths, by least squares.
+
+        Args:
+            paths: points (M, 3) and times (T,) -> where the points are (M, T, 3), in world units.
+            times: T, in [0, 1].
+        """
+        points = self.lattice.to_world(self.learned.voxels)
+        when = points.new_tensor([self.canonical_time, *times])
+        went = paths(points, when).to(points)
+        flow = (went[:, 1:] - went[:, :1]).double()
+        basis = self.basis(when[1:]).double()
+        found = torch.linalg.lstsq(basis, flow.transpose(0, 1).flatten(1)).solution  # (K, 3 M)
+        found = found.reshape(self.bases, -1, 3).permute(1, 2, 0) / self.scale
+        self.learned.coefficients.copy_(found.flatten(1))
+
     def trajectories(self, points: Tensor, times: Tensor) -> Tensor:
         """Return the paths (N, T, 3) of canonical points (N, 3) at ``times`` (T,), in world units."""
-        if not self.at_nodes:
+        if not self.at_nodes or self.learned is not None:
             flow = _matmul(self.coefficients(points), self.basis(times).T)  # (N, 3, T)
             return points[:, None] + flow.transpose(1, 2)
         nodes, index, coordinates = self._nodes_around(points)

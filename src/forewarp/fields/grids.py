@@ -143,6 +143,16 @@ class RadianceGrid:
         """Colour (P, 3) at lattice coordinates (P, 3) seen along unit directions (P, 3)."""
         return shaded(self.features(points), directions, shade)
 
+    def read(
+        self, points: Tensor, shade: Shade | None
+    ) -> tuple[Tensor, Callable[[Tensor | slice, Tensor], Tensor]]:
+        """Return the density (P,) at lattice coordinates (P, 3), and a function: rows (K,) of these points,
+        directions (K, 3) -> colour (K, 3). Cost: one read of all channels.
+        """
+        values = trilinear(self.values, self.index, points, self.fill)
+        sigma = self.activation.sigma(values[:, 0])
+        return sigma, lambda rows, directions: shaded(values[rows, 1:], directions, shade)
+
 
 class VoxelGrid(nn.Module):
     """Parameters (N, C) with one row per active voxel, and buffers with the voxels' positions.

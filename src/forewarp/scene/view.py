@@ -110,7 +110,9 @@ class Asks:
     ``kind``: single ``pixels``, square ``crops`` of ``side`` pixels, or ``pictures``, whole images.
     ``neighbours``: how many of the nearest other training times to observe too. ``instant``: up to how many
     whole training images of the picked time to add. ``straight``: give pixels as stored, not composited.
-    ``sensed``: give the depth of pixels where a sensor measured it.
+    ``sensed``: give the depth of pixels where a sensor measured it. ``near``: share of single pixels,
+    below 1, that is drawn on and beside what an image with alpha shows; ``Observation.shares`` make up for
+    it.
     """
 
     kind: str = "pixels"
@@ -119,6 +121,7 @@ class Asks:
     instant: int = 0
     straight: bool = False
     sensed: bool = False
+    near: float = 0.0
 
     def __post_init__(self) -> None:
         if self.kind not in KINDS or min(self.side - 1, self.neighbours, self.instant) < 0:
@@ -138,7 +141,7 @@ class Observation:
     of rays that hit nothing. If the method asks for ``straight`` pixels, ``rgb`` is (R, 4) uint8: colour
     and alpha as stored. ``valid`` (R,) bool: those to learn from; None: all, as always of single pixels.
     ``sensed`` (2, R), if asked for and known: the depth of their rays, 0 where there is none, and its
-    confidence.
+    confidence. ``shares`` (R,): how often each single pixel counts, once on average; None: once.
     """
 
     moment: Moment
@@ -147,6 +150,7 @@ class Observation:
     background: Tensor
     valid: Tensor | None = None
     sensed: Tensor | None = None
+    shares: Tensor | None = None
 
     __repr__ = brief
 
@@ -211,6 +215,11 @@ class Batch:
         rays = joined([o.view.rays() for o in self.observations])
         backgrounds = [o.background.expand(len(o.view), 3) for o in self.observations]
         return rays, torch.cat([o.rgb for o in self.observations]), torch.cat(backgrounds)
+
+    def shares(self) -> Tensor | None:
+        """Return how often each ray (R,) of ``joined`` counts; None: each once."""
+        shares = [observation.shares for observation in self.observations]
+        return None if shares[0] is None else torch.cat(shares)
 
     def split(self) -> list[Batch]:
         """Return a batch of each observation."""

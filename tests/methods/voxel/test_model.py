@@ -115,6 +115,48 @@ def test_carrying_keeps_matter_motion_and_unit():
         assert torch.equal(value, path[name])
 
 
+NODES = partial(TrajectoryField, bases=4, nodes=16, kind="nodes")
+F2 = partial(TrajectoryField, bases=4, nodes=8, width=32, layers=3)
+
+
+@pytest.mark.parametrize(
+    ("trajectory", "carry"), [(NODES, "motion"), (NODES, "all"), (F2, "motion"), (NODES, "none")]
+)
+def test_motion_is_carried_with_matter_or_without(trajectory, carry):
+    model = tiny.forward_model(trajectory=trajectory)
+    before, times = fresh(model), torch.tensor([0.4, 1.0])
+    last = list(before.motion.trajectory.parameters())[-1]
+    torch.nn.init.normal_(last, std=0.01)
+    before.radiance.density.data.normal_()
+    points = 0.5 * torch.rand(50, 3, generator=torch.Generator().manual_seed(0)) - 0.25
+    went = before.trajectories(points, times).detach() - points[:, None]
+    after = carried(before, left(before), model, num_voxels=[[0, 3000]], carry=carry)
+    goes = after.trajectories(points, times).detach() - points[:, None]
+    alike = (goes - went).norm() / went.norm()
+    assert alike == 1.0 if carry == "none" else alike < (1e-5 if trajectory is not NODES else 0.5)
+    assert (len(after.radiance.density.unique()) > 1) == (carry == "all")
+
+
+def test_learned_nodes_begin_with_the_motion_of_another_method():
+    class Turning(torch.nn.Module):
+        moves = True
+
+        def trajectories(self, points, times):
+            return points[:, None] + times[:, None] * points[:, None] @ torch.eye(3).roll(1, 0) * 0.1
+
+    model, times = tiny.forward_model(trajectory=NODES), torch.tensor([0.25, 0.8])
+    after = carried(Turning(), Handover(tiny.BOX, True, 6), model)
+    points = 0.5 * torch.rand(50, 3, generator=torch.Generator().manual_seed(0)) - 0.25
+    first = Turning().trajectories(points, torch.tensor([SCENE.canonical_time]))
+    expected = points[:, None] + Turning().trajectories(points, times) - first
+    torch.testing.assert_close(after.trajectories(points, times), expected, atol=5e-3, rtol=0)
+    f2 = tiny.forward_model()
+    still = carried(Turning(), Handover(tiny.BOX, True, 6), f2).trajectories(points, times)
+    assert torch.equal(still[:, 0], still[:, 1])
+    with pytest.raises(ValueError, match=r"^stage.fine.carry: expected all or none, as the network F2"):
+        carried(Turning(), Handover(tiny.BOX, True, 6), f2, carry="motion")
+
+
 @pytest.mark.parametrize("nodes", [0, 8])
 def test_deformation_features_lie_at_nodes_or_voxels_and_are_carried_to_others(nodes):
     model = tiny.forward_model(trajectory=partial(TrajectoryField, bases=3, nodes=nodes, features=2))
@@ -195,7 +237,13 @@ STAGES = [
     *(({"num_voxels": given}, SCHEDULE) for given in ([], [[0.5, 100], [0, 100]], 100, [[2, 9]], [[0, 0]])),
     ({"bases": [[0, 1, 2]]}, "stage.coarse.bases: expected"),
     ({"effects": ["motion", "shine"]}, "stage.coarse.effects: expected some of .* got .*shine"),
-    ({"start": "points"}, "stage.coarse.start: expected auto, box or hull, but got 'points'"),
+    ({"start": "points"}, "stage.coarse.start: expected auto, box, hull or matter, but got 'points'"),
+    (
+        {"start": "matter"},
+        "stage.coarse.start: expected auto, box or hull, as no stage before it left matter",
+    ),
+    ({"carry": "box"}, "stage.coarse.carry: expected all, motion or none, but got 'box'"),
+    ({"near_share": 1.0}, r"stage.coarse.near_share: expected a number in \[0, 1\), but got 1.0"),
     ({"confine": 1.5}, r"stage.coarse.confine: expected a fraction in \[0, 1\], but got 1.5"),
     ({"start_alpha": 1.0}, r"stage.coarse.start_alpha: expected a number in \(0, 1\), but"),
     ({"box_alpha": 0.0}, r"stage.coarse.box_alpha: expected a number in \(0, 1\), but"),
@@ -229,6 +277,8 @@ def test_refuses_by_the_name_of_the_key(call, text):
 
 
 PATCHES = torch.rand(2, 4, 4, generator=torch.Generator().manual_seed(3)), torch.ones(2, 4, 4)
+CORNERS = torch.tensor([[0, 1, 2, 3]])
+BESIDE = torch.randn(5, 3, generator=torch.Generator().manual_seed(4)), CORNERS, torch.ones(3)
 STRAY = torch.randn(7, 3, generator=torch.Generator().manual_seed(3))
 TRUTH = torch.rand(4, 3, generator=torch.Generator().manual_seed(9))
 
@@ -246,6 +296,7 @@ def terms_of(renderings, literal=(), **on):
     torch.nn.init.normal_(method.radiance.density)
     method.printed, method._patches_of = frozenset(literal), lambda *_: PATCHES
     method._stray = lambda *_: STRAY if on else None
+    method.motion.trajectory.beside = lambda *_: BESIDE
     canonical = method.radiance()
     state = VoxelSnapshot(
         Moment(0.5), {}, canonical, method.renderer, length=0.5, **{k: v(canonical) for k, v in on.items()}
@@ -274,6 +325,7 @@ def test_every_term_is_the_pure_function_of_its_parts():
         "inpaint_diff": losses.inpaint_diff(state.inpaint_difference),
         "tv_density": sum(losses.tv_density(g.raw_density, pairs) for g in (grid, state.background)),
         "tv_flow": losses.tv_flow(flow, pairs),
+        "rigid": losses.strain(*BESIDE),
         "tv_depth": losses.tv_depth(*PATCHES),
         "static_points": losses.static_points(STRAY),
         "moving_opacity": losses.moving_opacity(grid.activation.alpha(grid.raw_density, grid.voxel_size)),
@@ -282,7 +334,7 @@ def test_every_term_is_the_pure_function_of_its_parts():
 
 
 def test_terms_of_effects_that_are_off_are_left_out():
-    off = {"flow_l1", "tv_flow", "inpaint_diff", "static_points", "moving_opacity"}
+    off = {"flow_l1", "tv_flow", "rigid", "inpaint_diff", "static_points", "moving_opacity"}
     assert set(terms_of({"warped": drawn(0)})[1]) == set(VoxelMethod.terms) - off
 
 

@@ -8,12 +8,16 @@ import torch
 from torch import Tensor
 
 from forewarp.fields.grids import DirectRadiance
-from forewarp.methods.method import Start, those_that_hold
+from forewarp.methods.method import HasTrajectories, Start, those_that_hold
+from forewarp.methods.rows import renew_parameters
 from forewarp.methods.voxel.effects import LearnedUpsampler, TrilinearUpsampler, UNet3d, inpaint, outline_of
-from forewarp.methods.voxel.model import Factory, VoxelMethod, VoxelSnapshot
+from forewarp.methods.voxel.model import Factory, VoxelMethod, VoxelSnapshot, copy_shared
 from forewarp.methods.voxel.structure import EFFECTS
 from forewarp.ops.backend import check_value
+from forewarp.scene.frame import spread
 from forewarp.scene.view import Moment
+
+_FITTED_TIMES = 48  # by which learned nodes begin with a known motion
 
 
 class ForwardWarp(VoxelMethod):
@@ -71,6 +75,36 @@ class ForwardWarp(VoxelMethod):
             other = "set it to 2, or choose model/inpainter=none"
             check_value("model.upsampler.scale", scale, wanted, lambda scale: scale == int(scale), other)
         self.begin(start)
+        if self.moves and not start.blank:
+            self.begin_motion(start)
+
+    def begin_motion(self, start: Start) -> None:
+        """Begin with the motion of the stage before, where this stage carries it and has not copied it yet.
+
+        Raises:
+            ValueError: if F2 should take over the motion of something else.
+        """
+        before, learns = start.before, self.motion.trajectory.learned is not None
+        self._follow(None)
+        if self.stage.carry == "none" or not isinstance(before, HasTrajectories) or not before.moves:
+            return
+        alike = isinstance(before, ForwardWarp) and learns == (before.motion.trajectory.learned is not None)
+        if alike and self.stage.carry == "all":
+            return  # copied
+        if learns:
+            times = [start.scene.times[i] for i in spread(len(start.scene.times), _FITTED_TIMES)]
+            self.motion.trajectory.fit(before.trajectories, times)
+        elif self.stage.carry == "motion":
+            wanted = "all or none, as the network F2 takes over the motion of an F2 alone"
+            other = "set it so, or model.trajectory.kind=nodes"
+            check_value(f"stage.{start.stage}.carry", "motion", wanted, lambda _: alike, other)
+            copy_shared(before.motion, self.motion)
+
+    def _follow(self, optimizer: torch.optim.Optimizer | None) -> None:
+        """Let learned nodes be those around the active voxels."""
+        changed = self.motion.trajectory.follow(self.radiance)
+        if changed is not None and optimizer is not None:
+            renew_parameters(optimizer, *changed)
 
     def outlines(self) -> dict[str, list[dict]]:
         """Describe the inpainter, with a learned up-sampler's layers."""
@@ -115,6 +149,8 @@ class ForwardWarp(VoxelMethod):
         if self.motion is not None:
             notes |= {
                 "motion (F2) at the nodes of a coarse lattice": self.motion.trajectory.at_nodes,
+                "learned at these nodes, without the network F2": self.motion.trajectory.learned is not None,
+                "neighbouring nodes move as rigidly as they can (rigid)": self.weights.get("rigid", 0) > 0,
                 "cosines of a longer period (padding)": self.motion.trajectory.padding > 0,
                 "matter fades where little of it is splatted (tau, fade)": True,
             }
@@ -124,6 +160,7 @@ class ForwardWarp(VoxelMethod):
         """Follow the schedules of the lattices and of the trajectory bases."""
         noted = super().advance(progress, step, optimizer)
         if self.motion is not None:
+            self._follow(optimizer)
             noted["bases_in_play"] = self.motion.trajectory.play(self.stage.at("bases", progress))
         return noted
 

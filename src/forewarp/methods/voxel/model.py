@@ -32,7 +32,7 @@ from forewarp.renderer import Marched, Renderer
 from forewarp.scene.box import Box, Lattice
 from forewarp.scene.camera import RandomPatches, Rays
 from forewarp.scene.cloud import Cloud
-from forewarp.scene.view import Batch, Moment, Rendering, View
+from forewarp.scene.view import Asks, Batch, Moment, Rendering, View
 
 SOLID = 0.1  # opacity over one voxel above which it counts as matter
 _NOTHING = 1e-3  # opacity over a voxel below which no colour is computed
@@ -132,7 +132,7 @@ class VoxelMethod(Method):
     """
 
     terms = ("photo", "point_color", "background_entropy", "flow_l1", "inpaint_diff", "tv_density", "tv_flow")
-    terms += ("tv_depth", "static_points", "moving_opacity")
+    terms += ("rigid", "tv_depth", "static_points", "moving_opacity")
     literal = ("photo", "point_color", "background_entropy")  # their printed form differs
     numbers = tuple(field.name for field in fields(VoxelStage) if field.name != "name")
     still_steps = 150  # a step is of rays of many images
@@ -192,20 +192,14 @@ class VoxelMethod(Method):
         """Take over what the stage before has learned, or start with faint matter; prepare the loss terms."""
         before = _carried(start, self.stage)
         if before is not None:
-            grids = dict(self.named_modules())
-            for place, grid in before.named_modules():
-                # F2's features; those of voxels are resampled by now.
-                if place in grids and isinstance(grid, VoxelGrid) and grid.lattice != grids[place].lattice:
-                    empty = dict.fromkeys(grid.names, 0.0)
-                    grid.resample(grids[place].lattice, grids[place].index >= 0, empty)
             for key in self.grids.keys() - before.grids.keys():  # a background that only this stage has
                 self.grids[key].fill(self.stage.start_alpha)
-            ours, theirs = self.state_dict(), before.state_dict()
-            alike = {k: v for k, v in theirs.items() if torch.is_tensor(v) and k in ours}
-            self.load_state_dict(ours | {k: v for k, v in alike.items() if v.shape == ours[k].shape})
+            copy_shared(before, self)
         elif not start.blank:
             for grid in self.grids.values():
                 grid.fill(self.stage.start_alpha)
+        if self.stage.near_share > 0:
+            self.asks = Asks(near=self.stage.near_share)
         self.weights, self.printed = start.weights, frozenset(start.literal)
         self._photo_on = start.photo_on
         cameras = [frame.camera for frame in start.scene.train]
@@ -245,12 +239,18 @@ class VoxelMethod(Method):
         noted["dropped_voxels"] = state.dropped
         if state.coverage is not None:
             noted["coverage"] = float(state.coverage.detach().clamp(max=1).mean())
-        terms = self.terms_of(state, renderings, rgb, generator)
-        error = (best.rgb.detach() - rgb).square().mean()
+        shares = batch.shares()
+        terms = self.terms_of(state, renderings, rgb, generator, shares)
+        error = losses.photometric(best.rgb.detach(), rgb, shares=shares)
         return Step(terms, error, noted, tensors=partial(_tensors, state, renderings))
 
     def terms_of(
-        self, state: VoxelSnapshot, renderings: dict[str, Marched], rgb: Tensor, generator: torch.Generator
+        self,
+        state: VoxelSnapshot,
+        renderings: dict[str, Marched],
+        rgb: Tensor,
+        generator: torch.Generator,
+        shares: Tensor | None = None,
     ) -> dict[str, Callable[[], Tensor | None]]:
         """Return the loss terms: what each function of ``losses`` is applied to.
 
@@ -261,21 +261,28 @@ class VoxelMethod(Method):
             renderings: renderings of the batch's R rays, by name; per-ray terms are summed over them.
             rgb: the true colours (R, 3).
             generator: draws random views, and some of the static points.
+            shares: (R,) how often each ray counts; None: once.
         """
         seen, canonical, literal = renderings.values(), state.canonical, self.printed
+        time = state.moment.time
 
         def of(effect: Any, loss: Callable[[Any], Tensor]) -> Callable[[], Tensor | None]:
             return lambda: None if effect is None else loss(effect)
 
+        def photo() -> Tensor:
+            form = {"literal": "photo" in literal, "shares": shares}
+            return sum(losses.photometric(r.rgb, rgb, **form) for r in seen)
+
         def point_color() -> Tensor:
             ids = [r.all_ray_ids if "point_color" in literal else None for r in seen]
             samples = [(r.weights, r.colors, r.ray_ids) for r in seen]
-            return sum(losses.point_color(*s, rgb, all_ray_ids=every) for s, every in zip(samples, ids))
+            pairs = zip(samples, ids)
+            return sum(losses.point_color(*s, rgb, all_ray_ids=every, shares=shares) for s, every in pairs)
 
         def background_entropy() -> Tensor:
             if "background_entropy" in literal:
                 return sum(losses.sample_entropy(r.all_weights) for r in seen)
-            return sum(losses.background_entropy(r.transmittance) for r in seen)
+            return sum(losses.background_entropy(r.transmittance, shares) for r in seen)
 
         def tv_density() -> Tensor:
             grids = [grid for grid in (canonical, state.background) if grid is not None]
@@ -284,8 +291,11 @@ class VoxelMethod(Method):
         def tv_flow(flow: Tensor) -> Tensor:
             return losses.tv_flow(flow / state.length, self._neighbours(canonical.index))
 
+        def rigid(_: Tensor) -> Tensor:
+            return losses.strain(*self.motion.trajectory.beside(self.radiance, time))
+
         def static_points() -> Tensor | None:
-            stray = self._stray(state.moment.time, generator)
+            stray = self._stray(time, generator)
             return None if stray is None else losses.static_points(stray)
 
         def moving_opacity(_: RadianceGrid) -> Tensor:
@@ -293,13 +303,14 @@ class VoxelMethod(Method):
             return losses.moving_opacity(alpha)
 
         return {
-            "photo": lambda: sum(losses.photometric(r.rgb, rgb, literal="photo" in literal) for r in seen),
+            "photo": photo,
             "point_color": point_color,
             "background_entropy": background_entropy,
             "flow_l1": of(state.flow, lambda flow: losses.flow_l1(flow / state.length)),
             "inpaint_diff": of(state.inpaint_difference, losses.inpaint_diff),
             "tv_density": tv_density,
             "tv_flow": of(state.flow, tv_flow),
+            "rigid": of(state.flow, rigid),
             "tv_depth": lambda: losses.tv_depth(*self._patches_of(state, generator)),
             "static_points": static_points,
             "moving_opacity": of(state.background, moving_opacity),
@@ -443,8 +454,23 @@ class VoxelMethod(Method):
 
 def _carried(start: Start, stage: VoxelStage) -> VoxelMethod | None:
     """Return the method of the stage before, if this stage continues with its grids."""
-    before = start.before if stage.carry and not start.blank else None
+    before = start.before if stage.carry == "all" and not start.blank else None
     return before if isinstance(before, VoxelMethod) else None
+
+
+def copy_shared(before: nn.Module, after: nn.Module) -> None:
+    """Copy what two modules have in common; resample the first one's grids to the lattices of the other.
+
+    Those of voxels have them by now; F2's features and learned nodes do not.
+    """
+    grids = dict(after.named_modules())
+    for place, grid in before.named_modules():
+        if place in grids and isinstance(grid, VoxelGrid) and grid.lattice != grids[place].lattice:
+            empty = {name: 0.0 for name in grid.names if name != "coefficients"}
+            grid.resample(grids[place].lattice, grids[place].index >= 0, empty)
+    ours, theirs = after.state_dict(), before.state_dict()
+    alike = {k: v for k, v in theirs.items() if torch.is_tensor(v) and k in ours}
+    after.load_state_dict(ours | {k: v for k, v in alike.items() if v.shape == ours[k].shape})
 
 
 def _tensors(state: VoxelSnapshot, renderings: Mapping[str, Marched]) -> Iterable[tuple[str, Tensor | None]]:

@@ -26,6 +26,7 @@ EFFECTS = (
     Effect("upsampler"),
 )
 NAMES = tuple(effect.name for effect in EFFECTS)
+CARRIED = ("all", "motion", "none")
 
 
 @dataclass(frozen=True)
@@ -37,9 +38,11 @@ class VoxelStage:
         background_num_voxels: as ``num_voxels``, for the static background's grid over the scene's box.
         effects: effects of the model to use in this stage, some of ``NAMES``.
         upsample: interpolate by this factor instead of the model's up-sampler; None: use the model's.
-        carry: continue with the grids of the stage before, if it was a voxel method; False: use its box only.
-        start: voxels that are active at first: ``box`` (all), ``hull`` (the visual hull; needs alpha), or
-            ``auto`` (the hull if the images have alpha, else the box).
+        carry: what the stage before passes on besides its box: ``all``, the grids and the motion, if it was a
+            voxel method, else its motion; ``motion`` alone; ``none``. Old runs have True and False.
+        start: voxels that are active at first: ``box`` (all), ``hull`` (the visual hull; needs alpha),
+            ``matter`` (beside the points that the stage before left), or ``auto`` (the hull if the images
+            have alpha, else the box).
         hull_grow: dilate the hull's silhouettes by this share of the image's width, as the scene moves.
         hull_misses: number of views that may disagree about a voxel of the hull.
         hull_frames: make the hull from this many frames nearest to the canonical time, and all frames of the
@@ -56,6 +59,8 @@ class VoxelStage:
         start_alpha: opacity of the first active voxels.
         color_threshold: the renderer's threshold in this stage; None: unchanged.
         bases: ``[[fraction, K], ...]``: use K trajectory bases from ``fraction`` on; empty: all.
+        near_share: share of a step's rays that is drawn on and beside what the images show (needs alpha);
+            rays count as much less as they are drawn more often there. 0: all are drawn anywhere.
         patches: number of patches that the depth term renders.
         name: name of the stage, for errors.
 
@@ -67,7 +72,7 @@ class VoxelStage:
     background_num_voxels: Sequence[Sequence[float]] = ((0.0, 262144),)
     effects: Sequence[str] = NAMES
     upsample: float | None = None
-    carry: bool = True
+    carry: str | bool = "all"
     start: str = "box"
     hull_grow: float = 0.01
     hull_misses: int = 0
@@ -82,6 +87,7 @@ class VoxelStage:
     start_alpha: float = 0.05
     color_threshold: float | None = None
     bases: Sequence[Sequence[float]] = ()
+    near_share: float = 0.0
     patches: int = 16
     name: str = "fine"
 
@@ -90,9 +96,13 @@ class VoxelStage:
         for key in ("num_voxels", "background_num_voxels", *(["bases"] if self.bases else [])):
             steps_of(f"{where}.{key}", getattr(self, key))
         check_effects(f"{where}.effects", self.effects, NAMES)
-        starts = ("auto", "box", "hull")
-        check_value(f"{where}.start", self.start, "auto, box or hull", lambda kind: kind in starts)
+        if isinstance(self.carry, bool):  # of older runs
+            object.__setattr__(self, "carry", "all" if self.carry else "none")
+        check_value(f"{where}.carry", self.carry, "all, motion or none", lambda what: what in CARRIED)
+        starts = ("auto", "box", "hull", "matter")
+        check_value(f"{where}.start", self.start, "auto, box, hull or matter", lambda kind: kind in starts)
         check_number(f"{where}.confine", self.confine, *FRACTION)
+        check_number(f"{where}.near_share", self.near_share, "a number in [0, 1)", lambda s: 0 <= s < 1)
         for key in ("box_alpha", "start_alpha"):
             check_number(f"{where}.{key}", getattr(self, key), "a number in (0, 1)", lambda a: 0 < a < 1)
         wanted = "0 < birth_alpha < keep_alpha < 1, or fog spreads"
@@ -105,11 +115,22 @@ class VoxelStage:
 
 
 def first_voxels(start: Start, stage: VoxelStage, lattice: Lattice) -> Tensor:
-    """Return the voxels (X, Y, Z) bool that are active at first: the visual hull, or all.
+    """Return the voxels (X, Y, Z) bool that are active at first: the visual hull, those beside matter, all.
 
     Cost: a hull reads each of its images once.
+
+    Raises:
+        ValueError: for a hull of images without alpha, or matter that no stage has left.
     """
     scene, everywhere = start.scene, torch.ones(lattice.shape, dtype=torch.bool)
+    if stage.start == "matter" and not start.blank:
+        if start.handover is None or start.handover.cloud is None or not len(start.handover.cloud):
+            why = "as no stage before it left matter"
+            raise ValueError(f"stage.{start.stage}.start: expected auto, box or hull, {why}, but got matter")
+        at = lattice.to_lattice(start.handover.cloud.points).round().long()
+        occupied = torch.zeros_like(everywhere)
+        occupied[at[lattice.holds(at)].unbind(-1)] = True
+        return dilate(occupied, 1)
     hull = stage.start == "hull" or (stage.start == "auto" and scene.has_alpha)
     if start.blank or not hull:
         return everywhere
