@@ -244,8 +244,8 @@ def write_png(path: Path, image: Tensor) -> Path:
 
 
 def png_bytes(image: Tensor) -> bytes:
-    """Encode (H, W, 3) in [0, 1]."""
-    return iio.imwrite("<bytes>", to_bytes(image), extension=".png")
+    """Encode (H, W, 3) in [0, 1], rounded as metrics round it."""
+    return iio.imwrite("<bytes>", to_bytes(image.double()), extension=".png")
 
 
 def jpeg_bytes(image: Tensor, quality: int) -> bytes:

@@ -365,7 +365,12 @@ def _save(view: RenderedView, folder: Path, is_on_sheet: bool) -> None:
         parts = {"sheets": (truth, image, error_colors(truth, image))}
         parts |= {"depth": _depth_parts(best, target)} if target.depth is not None else {}
         for place, of_place in parts.items():
-            write_png(folder / place / name, in_a_row([at_least(part, _SHEET_SIDE) for part in of_place]))
+            write_sheet(folder / place / name, of_place)
+
+
+def write_sheet(path: Path, images: Sequence[Tensor]) -> None:
+    """Write images (H, W, 3) beside each other as a PNG, small ones enlarged."""
+    write_png(path, in_a_row([at_least(image, _SHEET_SIDE) for image in images]))
 
 
 def _depth_parts(rendering: Rendering, target: Target) -> list[Tensor]:
@@ -388,8 +393,12 @@ def show(metrics: dict, folder: Path) -> None:
     console.print(table_of(metrics))
     others = ("train", "render_per_frame", "render_again_per_frame")
     stages = ", ".join(f"{name} {time_text(s)}" for name, s in seconds.items() if name not in others)
-    spent, frame, again = time_text(seconds["train"]), *(f"{seconds[name]:.3g} s" for name in others[1:])
-    lines = [f"trained {spent} ({stages}), {frame} a frame, {again} another at the same time"]
+    lines = []
+    if "train" in seconds:
+        lines.append(f"trained {time_text(seconds['train'])}" + (f" ({stages})" if stages else ""))
+    if others[1] in seconds:  # not of images that another program rendered
+        frame, again = (f"{seconds[name]:.3g} s" for name in others[1:])
+        lines[-1] += f", {frame} a frame, {again} another at the same time"
     if flow and flow["epe_moving"] is not None:
         error, motion = flow["epe_moving"], flow["motion_mean"]
         share = f"{error / motion:.0%} of their motion {motion:.4f}"

@@ -63,7 +63,7 @@ COUNTERPART = "counterpart of "  # begins the dataset of synthetic scenes that s
 # What pages tell of a run's protocol.
 PROTOCOL = ("half_resolution", "scale", "split", "frames", "views", "train_frames", "train_views")
 PROTOCOL += ("test_views", "test_cameras", "test_moments", "test_frames", "window", "measured", "held_out")
-PROTOCOL += ("canonical_time", "mask_box", "exposure")
+PROTOCOL += ("canonical_time", "mask_box", "exposure", "images", "megabytes")
 OWN = "run|sheets|paths.runs|paths.data"  # keys that say where a run's files are, not what it is
 # What stands for the folders of whoever types a command again.
 PLACES = {"paths.scenes": "DATASETS", "data.root": "SCENES", "lpips_weights": "WEIGHTS"}
@@ -382,10 +382,10 @@ def read_run(folder: Path) -> Row:
     row["size"] = next(map(float, sizes.values()), None)
     row |= dict.fromkeys(("train", "step", "frame", "memory", "parameters"))
     if metrics:
-        row["train"], row["frame"] = metrics["seconds"]["train"], metrics["seconds"].get("render_per_frame")
+        row["train"], row["frame"] = (metrics["seconds"].get(n) for n in ("train", "render_per_frame"))
         row["step"] = row["train"] / row["steps"] if row["steps"] else None
         row["memory"] = metrics["peak_memory_bytes"] / 2**30 if metrics.get("peak_memory_bytes") else None
-        row["parameters"] = metrics["parameters"] / 1e6
+        row["parameters"] = metrics["parameters"] / 1e6 if "parameters" in metrics else None
     # The metrics that tables of many runs show; of LPIPS that of one net.
     row["ability"] = [*(kind for kind in ("all", "time") if kind in test), *test, "all"][0]
     scores = test.get(row["ability"], {})

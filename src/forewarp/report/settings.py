@@ -31,6 +31,7 @@ NOT_COUNTED = {
     **dict.fromkeys(("evaluate", "score", "lpips_weights"), "what is measured, not how"),
     **dict.fromkeys(("checkpoint_seconds", "resume", "trust", "absent", "data_changed"), "how the job runs"),
     "plan_only": "such a run is not made",
+    "renders": "where images lay that another program rendered",
     "sentinel.skip": "how many broken steps may be",
     "callbacks": "ours only watch; those of other packages count",
     **dict.fromkeys(("command", "variant", "debug"), "names; a debug run is left out as a whole"),
@@ -50,6 +51,7 @@ IN_COLUMNS = {
     "windows",
 }
 IN_COLUMNS |= {"data.held_out", "data.half_resolution", "data.scale", "trainer"}
+IN_COLUMNS |= {"name", "minutes", "device", "megabytes"}  # of images that another program rendered
 IN_COLUMNS |= {"sweeps", "launcher", "budget.minutes", "budget.iterations", "budget.clock", "budget"}
 
 DIGEST = "configuration"  # names rows of tables whose configurations nothing else tells apart

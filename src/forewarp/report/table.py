@@ -60,7 +60,8 @@ def write_table(
             Path(", ".join(map(str, folders))), runs, left_out, "runs with a metrics.json", "make some"
         )
     for row in runs:
-        row["bytes"] = row["parameters"] and 4 * row["parameters"]  # of 32 bits
+        told = (row["metrics"].get("protocol") or {}).get("megabytes")  # of images from elsewhere
+        row["bytes"] = told if row["parameters"] is None else 4 * row["parameters"]  # of 32 bits
     cells = runs_by_cell(runs, rows, columns)
     table = table_of(cells, rows, columns, metrics)
     text = f"{table}\n" + "".join(f"\nLeft out: {line}\n" for line in left_out)

@@ -229,6 +229,9 @@ def read_config(path: Path, trust: Sequence[str] | None = (), unused: Sequence[s
     """
     config = trusted_config(read_text(path, MOST_CONFIG), path, trust, unused)
     check_outline(OmegaConf.to_container(config), f"{path}: ")
+    if config.get("renders") is not None:
+        advice = "measure them again by the command in this file"
+        raise mismatch(path, "a run of forewarp", "images that another program rendered", advice)
     for key in (*IDENTITY, "trainer", "callbacks"):
         if key not in config and key != "objective":  # a method may have no objective
             raise ValueError(f"{path}: expected the key {key}, but got none; delete the run's folder")

@@ -11,11 +11,12 @@ from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 
-# Keys that hold a path, the name of a scene's folder, or a regular expression, which is always one value;
+# Keys that hold a path, a name, or a regular expression, which is always one value;
 # those in which a list of paths may stand.
 PATTERN = re.compile(r"(data\.)?name_pattern")
 TEXTS = re.compile(
     r"data\.(root|scene)|paths\.\w+|plan\.folder|run2?|runs|resume|start|out|videos?|images|colmap|masks|curves|"
+    "renders|name|device|"
     f"published|lpips_weights|rows|columns|metric|{PATTERN.pattern}"
 )
 LISTS = ("runs", "published", "lpips_weights", "rows", "columns", "metric")
