@@ -93,6 +93,8 @@ EVEN_SCHEMES = {
     "two digits of the year": at(31, 60, "%y%m%d_%H%M%S"),
     "twelve hours": at(31, 60, "%Y-%m-%d_%I-%M-%S-%p"),
     "twelve hours without a date": at(31, 60, "%I-%M-%S %p", "2023-11-04T11:50:00"),
+    "time of day and millionths": at(0.53, 60, "%H%M%S_%f", "2023-11-04T10:58:50"),
+    "a frame's date": at(0.5, 60, "frame_%Y-%m-%d-%H-%M-%S_$"),
     "packed time codes": [code(89950 + i, 25) for i in range(90)],
     "packed time codes of film": [code(24 * 3599 + 5 * i, 24) for i in range(90)],
     "folders of a camera": [f"{100 + i // 9999}ND750/DSC_{i % 9999 + 1:04d}" for i in range(9990, 10008)],
@@ -143,6 +145,11 @@ def test_several_numbers_of_one_camera_order_one_film(names, times):
 def test_numbers_that_order_no_film_of_one_camera_are_refused(names):
     with refused("data.name_pattern"):
         read_names(names, "p", one_camera=True)
+
+
+def test_counters_behind_a_point_are_no_fractions():
+    names = [f"sh{shot}.{i}" for shot, end in ((1, 6010), (2, 6005)) for i in range(6001, end)]
+    assert read_names(names, "p", one_camera=True).times == pytest.approx(np.linspace(0, 1, 13))
 
 
 @pytest.mark.parametrize("form", ["{}_{:03d}", "s{}/{:03d}", "cam_{}_{:03d}", "{}-{:03d}"])
@@ -207,10 +214,13 @@ def test_cameras_beside_each_other_that_move_on_are_a_rig():
         (["cap_235000", "cap_235900", "cap_001000"], "times of day more than half a day apart"),
         (["11-50-00 PM", "11-59-00 PM", "12-10-00 AM"], "times of day more than half a day apart"),
         (["01.11.2023", "05.12.2023", "03.12.2023", "02.12.2023"], "begin with the day, or .* the month"),
-        (["x_101112", "x_101130", "x_101205", "x_101231"], "dates that begin with two .*, or times of day"),
+        (["x_101112", "x_101130", "x_101205", "x_101231"], "times of day, or dates that begin with two"),
         (["a_1.3", "a_1.9", "a_1.11", "a_2.12"], "seconds with a fraction, or a counter"),
         ([f"20231104_10111{s}_{f}" for s, f in ((2, 345), (3, 410), (4, 777))], "fractions of the seconds"),
         ([f"010059{f:02d}" for f in (1, 7, 20)] + ["01010001", "01010019"], "codes of 24 frames a second"),
+        ([f"f{i:06d}" for i in (3, 17, 48, 101, 122, 157)], "times of day, or a counter"),
+        (["23-59-58", "23-59-59", "00-00-01", "00-00-02"], "names that tell times in one way"),
+        ([f"{391642633 + i % 4}_{i**5 % 97 + 2}0667805286827_n" for i in range(9)], "in one way"),
         ([f"frame_{i:05d}" for i in (-50, -43, 6, 13)], "differs from image to image, as signs"),
         ([f"{c}_{i}" for c, n in ((1, 9), (2, 5)) for i in range(n)], "names that tell times in one way"),
     ],

@@ -68,6 +68,8 @@ _FEW = 4  # names below which a plain counter may look like a time by chance
 _EVEN, _UNEVEN = 0.5, 4.0  # longest step by the shortest, less 1: at most, times that of the best reading
 _SAME_TIMES = 0.25  # of the shortest step, by which times of two readings may differ that mean one thing
 _RATES = (24, 25, 30, 50, 60)  # frames a second of time codes
+_SHORT = 0.25  # of the time since a clock began, that a film lasts at most
+_MOST_DIGITS = 40  # of a time with its fraction
 _SKIPPED = 4  # numbers at most that time codes leave out at the beginning of a minute
 _CARRY = 3.0  # steps of the last number from its end and its beginning within which it is carried over
 _ODD_ALONE = 4  # images of a camera from which on one of a single image is an odd name
@@ -174,9 +176,9 @@ _TIME_CODE = re.compile(r"(?<![\d\0])(\d\d)(\d\d)(\d\d)(\d\d)(?!\d)")
 _APART_CODE = re.compile(r"(?<!\d)\d\d([-_.:])\d\d\1\d\d[-_.:;]\d\d(?!\d)")
 # What numbers of a name may say together, and how it is read.
 _FORMS: list[tuple[str, re.Pattern, Callable[[re.Match], float | None]]] = [
-    *((what, _date(order, behind), _instant) for order, what in _ORDERS.items() for behind in _WITH_TIME),
     (_TIME_OF_DAY, re.compile(rf"(?<![\d\0])(?=\d{{6}}){_PACKED}"), _of_day),
     (_TIME_OF_DAY, re.compile(rf"(?<![\d\0])(?=[-_.:\d]+{_IS_HALF}){_APART}"), _of_day),
+    *((what, _date(order, behind), _instant) for order, what in _ORDERS.items() for behind in _WITH_TIME),
     *((f"time codes of {rate} frames a second", _TIME_CODE, partial(_of_code, rate=rate)) for rate in _RATES),
 ]
 
@@ -414,13 +416,14 @@ def _composed(names: Sequence[str], where: str) -> Sequence[str]:
     """
     found: dict[tuple[int, int], dict[str, tuple]] = {}
     for what, pattern, read in _FORMS:
-        matches = [[*pattern.finditer(name)] for name in names]
+        matches = [[*pattern.finditer(name)] for name in (names if pattern.search(names[0]) else ())]
         for column in zip(*matches) if len({*map(len, matches)}) == 1 else ():
             values = [*map(read, column)]
-            is_few = len({*values}) < min(_FEW, len(names)) and not column[0].groupdict().get("Y")
-            if None not in values and len({*values}) > 1 and not is_few:  # few are of cameras
+            is_few = len({*values}) < min(_FEW, len(names))  # as of cameras
+            is_other = is_few or _FRAME.search(names[0][: column[0].start()])
+            has_year = column[0].groupdict().get("Y")
+            if None not in values and len({*values}) > 1 and (has_year or not is_other):
                 found.setdefault(column[0].span(), {})[what] = (column, values)
-    found = {span: of for span, of in found.items() if not _FRAME.search(names[0][: span[0]])}
     if not found:
         return names
     of = found[max(found, key=lambda span: span[1] - span[0])]
@@ -431,7 +434,8 @@ def _composed(names: Sequence[str], where: str) -> Sequence[str]:
     part = column[0].groupdict()
     no_seconds = part.get("H") and not part["S"] and not part["half"]
     may_count = no_seconds or (column[0][0].isdigit() and not part.get("Y"))
-    if may_count and (len(names) < _FEW or _unevenness(counts) < _ROUNDING):
+    is_small = column[0][0].isdigit() and max(counts) < 10 ** (len(column[0][0]) - 2)
+    if may_count and (len(names) < _FEW or is_small or _unevenness(counts) < _ROUNDING):
         readings[_COUNTER] = counts
     if np.ptp(readings.get(_TIME_OF_DAY, 0)) > 12 * 3600 and _unevenness(counts) >= _ROUNDING:
         raise _two_ways(where, names[0], "times of day more than half a day apart")
@@ -479,7 +483,9 @@ def _with_fractions(names: Sequence[str], where: str) -> Sequence[str]:
         return names
     for i in range(1, len(rows[0]), 2):
         is_camera = _word(rows, i, _CAMERA_WORD) and not _word(rows, i, _FRAME_WORD)
-        if any("\0" in row[i] for row in rows) or is_camera or len({row[i] for row in rows}) == 1:
+        column = {row[i] for row in rows}
+        is_no_time = len(column) == 1 or max(map(len, column)) > _MOST_DIGITS
+        if any("\0" in row[i] for row in rows) or is_camera or is_no_time:
             continue
         values = _decimals(rows, i, where)
         for row, value in zip(rows, values or ()):
@@ -504,7 +510,8 @@ def _decimals(rows: list[list[str]], place: int, where: str) -> list[float] | No
         are_whole = all(len(row) == 3 and row[0][-1:] in ("", "/") and not row[2] for row in rows)
         is_sure = is_stamp or (are_whole and width in (6, 9)) or _word(rows, place, _FRAME_WORD)
         # Two digits up to 59 are minutes or seconds.
-        reaches = width > 1 and most >= 0.5 * 10**width and (width > 2 or most >= 60)
+        spread = most if len({*whole}) == 1 else most - min(map(int, behind))
+        reaches = width > 1 and spread >= 0.5 * 10**width and (width > 2 or most >= 60)
         return decimals if is_sure or reaches else None
     readings = {}
     if not any(len(text) > 1 and text[-1] == "0" for text in behind):
@@ -581,9 +588,10 @@ def _joined_fraction(rows: list[list[str]], place: int, name: str, where: str) -
     """
     between = {row[place - 1] for row in rows}
     whole = [row[place - 2].partition(".") for row in rows]
-    is_whole = all(9 <= len(second) <= 10 and not int(rest or 0) for second, _, rest in whole)
+    is_whole = all((point or 9 <= len(second) <= 10) and not int(rest or 0) for second, point, rest in whole)
     behind = [row[place] for row in rows]
-    if len(between) > 1 or not between <= {*".,_-"} or not is_whole or any("." in text for text in behind):
+    is_number = all("." not in text and len(text) <= _MOST_DIGITS for text in behind)
+    if len(between) > 1 or not between <= {*".,_-"} or not is_whole or not is_number:
         return False
     widths, most = {*map(len, behind)}, max(map(int, behind))
     unit = 10 ** max(widths) if len(widths) == 1 else next((u for u in (10**3, 10**6, 10**9) if most < u), 0)
@@ -623,13 +631,15 @@ def _chosen(
         cameras = [tuple(row[i] for i in sorted({*texts, *others} - {place})) for row in rows]
         return _Reading(what, [float(row[place]) for row in rows], cameras)
 
-    clocks = [i for i in free if all(_is_stamp(row[i]) for row in rows)]
+    clocks = [i for i in free if _is_clock([row[i] for row in rows])]
     if clocks and not named:  # counters beside a clock say nothing more
         # Of whole seconds the number beside may count the images of each.
         is_fine = any(row[clocks[-1]].isdigit() or float(row[clocks[-1]]) % 1 for row in rows)
         readings = [of_place(clocks[-1], others) for others in (for_cameras, places)[: 1 + is_fine]]
         if unique := [reading for reading in readings if reading.is_unique]:
             return unique[0]
+    if not free:
+        raise _two_ways(where, name, "images of several cameras")
     together, parts = "all numbers together order one film", of_place(free[-1], for_cameras).cameras
 
     def of_film(order: Sequence[int], must_tell: bool) -> _Reading:
@@ -693,10 +703,14 @@ def _chosen(
     raise _two_ways(where, name, ", or ".join(readings))
 
 
-def _is_stamp(digits: str) -> bool:
-    """Tell whether digits are a date, or a clock's seconds, thousandths or less since some time long ago."""
-    whole, point, _ = digits.partition(".")
-    return len(whole) >= (9 if point else 13)
+def _is_clock(digits: Sequence[str]) -> bool:
+    """Tell whether numbers are dates, or a clock's seconds, thousandths or less since some time long ago, and
+    no random ones.
+    """
+    parts = [text.partition(".") for text in digits]
+    values = [*map(float, digits)]
+    are_long = all(len(whole) >= (9 if point else 13) for whole, point, _ in parts)
+    return are_long and max(values) - min(values) <= _SHORT * max(values)
 
 
 def _step(rig: _Reading, views: Sequence[Sequence[float]]) -> float:
@@ -721,7 +735,10 @@ def _ranked(
     keys = [tuple(float(row[i]) for i in places) for row in rows]
     ordered = sorted({*keys})
     last = [key[-1] for key in ordered]
-    if all(a < b for a, b in zip(last, last[1:])):
+    are_clocks = all(
+        ("." in row[i] or len(row[i]) == 2) and float(row[i]) < 60 for row in rows for i in places
+    )
+    if all(a < b for a, b in zip(last, last[1:])) and (not are_clocks or not may_carry):
         return [key[-1] for key in keys]
     joined, unit = dict(zip(ordered, ordered)), 1.0
     for part, place in list(zip(places, places[1:]))[::-1] if may_carry else ():  # minutes and seconds
@@ -796,7 +813,7 @@ def _unrolled(reading: _Reading) -> tuple[list[float], str]:
     """Continue a counter that began anew after its last number, as 9999; also say what was read."""
     frames, told = reading.frames, f"{reading.what}, {min(reading.frames):.10g} to {max(reading.frames):.10g}"
     highest, lowest = max(frames), min(frames)
-    turn = 10 ** len(f"{highest:.0f}")
+    turn = 10 ** min(len(f"{highest:.0f}"), _MOST_DIGITS)
     numbers = sorted({*frames})
     gap, after = max(((b - a, b) for a, b in zip(numbers, numbers[1:])), default=(0, 0))
     ends = sum(number >= 0.99 * turn for number in numbers), sum(number <= 0.01 * turn for number in numbers)
