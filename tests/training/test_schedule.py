@@ -22,6 +22,11 @@ def test_keys_that_the_platform_does_not_know_are_the_methods_own():
     assert (made.lr_hold, made.max_gradient) == (0.5, 2.0)
 
 
+def test_a_stage_without_rates_is_refused_by_their_key():
+    with pytest.raises(ValueError, match="^stage.fine.lr: expected a learning rate of each group"):
+        StageSettings.of("fine", iterations=1)
+
+
 @pytest.mark.parametrize(
     ("schedule", "expected"),
     [

@@ -68,7 +68,8 @@ def capture(
                 images = take(work, source, step, more, search.threads, _AGAIN)
                 found = find_poses(work, images, search, step, force)
         refuse_poses(found, images, force=force)
-        found = scene.placed(found)
+        if source.colmap is None:  # a world that is known stays, in its own unit
+            found = scene.placed(found)
         limits = scene.limits_of(found)
         with step("what moves, writing") as progress, folder_written_whole(out, ABOUT) as folder:
             burnt = read_mask(work / _BURNT) if (work / _BURNT).exists() else None

@@ -80,7 +80,13 @@ class StageSettings:
 
     @classmethod
     def of(cls, name: str, **keys: Any) -> StageSettings:
-        """Make settings from a stage's keys; keys that are not fields go to ``numbers``."""
+        """Make settings from a stage's keys; keys that are not fields go to ``numbers``.
+
+        Raises:
+            ValueError: where the learning rates are missing, or a value is none that its key may have.
+        """
+        if "lr" not in keys:
+            raise ValueError(f"stage.{name}.lr: expected a learning rate of each group, but got no such key")
         fields = {key: keys.pop(key) for key in list(keys) if key in cls.__dataclass_fields__}
         return cls(name, **fields, numbers=keys)
 
