@@ -8,13 +8,14 @@ import pytest
 import torch
 
 from forewarp.data import dnerf, nhr, posed_video
-from forewarp.data.cameras import check_camera
+from forewarp.data.cameras import FLIP, check_camera
 from forewarp.data.checks import check_seen, remarks
 from forewarp.data.files import SceneError
 from forewarp.data.images import is_premultiplied, straight, write_image
 from forewarp.scene.box import Box
 from forewarp.scene.camera import Camera, look_at
 from forewarp.scene.frame import Frame, sightings, walk_of
+from tests.support.room import shown, walk
 from tests.support.tiny_scene import ball_scene
 from tests.support.written_scenes import (
     MIDDLE,
@@ -436,7 +437,7 @@ def test_all_cameras_of_a_long_walk_are_asked_for_points_at_no_cost_of_their_siz
         eye = torch.tensor([float(i), 0.0, 0.0])
         pose = look_at(eye, eye + torch.tensor([0.0, 3.0, 0.0]), up)
         camera = Camera(4000, 3000, 12000.0, 12000.0, 2000.0, 1500.0, pose, 0.1, 10.0)
-        frames.append(Frame(f"{i}", i / 399, camera, lambda: torch.zeros(1)))
+        frames.append(Frame(f"{i}", i / 399, camera, lambda: torch.zeros(3, 4, 4, dtype=torch.uint8)))
     points = torch.stack([torch.linspace(0, 399, 2000), torch.full((2000,), 3.0), torch.zeros(2000)], 1)
     box = Box((-1, 0, -1), (400, 4, 1))
     street = replace(SCENE, train=tuple(frames), test=(), box=box, has_alpha=False, still=points)
@@ -484,3 +485,30 @@ def test_masks_the_other_way_round_are_told_by_points_or_their_place():
     assert "says move nothing in all 8 images looked at" in with_motion(middle & ~middle)
     assert "lie in what masks hide, 14% of images" in with_motion(~middle, still, "load_valid")
     assert "hide" not in with_motion(~middle, key="load_valid")
+
+
+@pytest.mark.parametrize(
+    ("keys", "change", "said"),
+    [
+        ({}, lambda pose: pose, None),
+        ({}, torch.linalg.inv, "if read with data.inverse=true; compare"),
+        ({}, lambda pose: pose @ torch.from_numpy(FLIP), "if read with data.axes=opencv; compare"),
+        ({"fl_x": 108.8, "fl_y": 108.8}, lambda pose: pose, "if focal lengths are 0.5 times as long; comp"),
+    ],
+)
+def test_poses_in_which_images_of_a_walk_do_not_agree_are_doubted(tmp_path, keys, change, said):
+    shots = [
+        posed_video.PosedShot(f"{i:02d}.png", camera, shown(camera)[0], i / 15)
+        for i, camera in enumerate(walk(16))
+    ]
+    posed_video.write_scene(tmp_path / "toy", shots, near=0.2, far=9.0)
+
+    def written(content):
+        for frame in content["frames"]:
+            frame["transform_matrix"] = change(torch.tensor(frame["transform_matrix"]).double()).tolist()
+
+    edit(tmp_path / "toy" / posed_video.FILE, written)
+    edit(tmp_path / "toy" / posed_video.FILE, keys)
+    lines = [line for line in remarks(posed_video.read_scene(tmp_path, "toy")) if "images agree" in line]
+    assert len(lines) == (said is not None)
+    assert (said or "") in "".join(lines)

@@ -489,6 +489,14 @@ def test_poses_written_in_another_way_are_refused_with_the_mend(matrix, said):
     [
         ({"cameras": {"0": {"fl_x": 80}}}, "cameras: not read, which seems to be of each camera; write fl_x"),
         ({"sensors": [{"id": 0, "focal_length": 80}]}, "sensors: not read, which seems to be of each camera"),
+        (
+            {"frames.3.fx": 40.0},
+            "frames: fx: not read, which seems to be of the camera; call a focal length in",
+        ),
+        (
+            {"frames.0.fov": 60},
+            "frames: fov: not read, which seems to be of the camera; call a focal length in",
+        ),
         ({"white_transparent": True}, "white_transparent: not read: images show their background; cut the"),
         ({"white_transparent": False, "cameras": [{"id": 0, "place": [0, 0, 0]}]}, None),
     ],

@@ -12,8 +12,11 @@ from torch.nn.functional import avg_pool2d, grid_sample, interpolate
 
 from forewarp.scene.camera import Camera
 
+# Views of a film that are compared, with others so many later: a share of all, and at least.
+COMPARED, BESIDE = 3, ((0, 0), (24, 2), (8, 6))
 SIDE = 64  # pixels of the longer side of images that are compared
 _PLANES, _NEIGHBOURS, _PATCH = 32, 2, 3
+_DISPARITY, _BOTH = 16, 0.3  # most pixels between two views; share of pixels that both show, at least
 _TEXTURED = 0.02  # deviation of grey in [0, 1] around a pixel, below which any depth fits it
 _LEAST_PIXELS, _SAMPLES = 100, 2000  # of a pair of views: fewest that tell, most that are looked at
 _APART = 1e-3  # least difference of two readings, as a share, that tells
@@ -38,36 +41,55 @@ def photo_error(cameras: Sequence[Camera], images: Sequence[Tensor]) -> float:
         away = (centers - centers[k]).norm(dim=-1)
         away[k] = torch.inf
         for other in away.argsort()[:_NEIGHBOURS].tolist():
-            cost = _swept(camera, image, cameras[other], images[other])
+            ends = 1 / camera.near, 1 / camera.far
+            cost = _swept(camera, image, cameras[other], images[other], *ends, _PLANES)
+            cost = cost[cost.isfinite()]
             if len(cost) >= _LEAST_PIXELS:
                 errors.append(float(cost.median()))
     return sum(errors) / len(errors) if errors else torch.inf
 
 
-def _swept(camera: Camera, image: Tensor, other: Camera, shown: Tensor) -> Tensor:
-    """Return the least difference (P,) over planes of depth, of textured pixels that another view sees."""
+def sweep_error(camera: Camera, image: Tensor, other: Camera, shown: Tensor) -> float:
+    """Return how far colours of two views differ where each pixel has the depth that suits it best, whatever
+    the unit of the cameras' places: the mean of pixels with texture; infinite where few are in both views.
+    """
+    baseline = float((camera.center - other.center).norm())
+    nearest = _DISPARITY / (camera.fx * max(baseline, 1e-12))
+    cost = _swept(camera, image, other, shown, 0.0, nearest, _DISPARITY + 1)
+    both = cost[cost.isfinite()]
+    if len(both) < max(_LEAST_PIXELS, _BOTH * len(cost)):
+        return torch.inf
+    return float(both.clamp(max=_WORST).mean())
+
+
+def _swept(
+    camera: Camera, image: Tensor, other: Camera, shown: Tensor, first: float, last: float, planes: int
+) -> Tensor:
+    """Return the least difference (P,) over planes between two inverse depths, of pixels with texture;
+    infinite where another view does not see them.
+    """
     axis = camera.camera_to_world[:3, 2]
     rays = camera.rays(dtype=torch.float64)
-    ends = 1 / torch.linspace(1 / camera.near, 1 / camera.far, _PLANES, dtype=torch.float64)
+    inverse = torch.linspace(first, last, planes, dtype=torch.float64)[:, None, None]
     along = rays.directions / (rays.directions @ axis)[:, None]
-    pixel, z = other.project(camera.center + ends[:, None, None] * along)
+    pixel, z = other.project(other.center + inverse * (camera.center - other.center) + along)
     grid = 2 * pixel / pixel.new_tensor([other.width, other.height]) - 1
     is_seen = (z > 0) & (grid.abs() < 1).all(-1)
-    grid = grid.reshape(_PLANES, camera.height, camera.width, 2).clamp(-2, 2)
+    grid = grid.reshape(planes, camera.height, camera.width, 2).clamp(-2, 2)
     warped = grid_sample(
-        shown.double().permute(2, 0, 1).expand(_PLANES, -1, -1, -1), grid, align_corners=False
+        shown.double().permute(2, 0, 1).expand(planes, -1, -1, -1), grid, align_corners=False
     )
-    planes = image.double().permute(2, 0, 1)
+    colors = image.double().permute(2, 0, 1)
     difference = avg_pool2d(
-        (warped - planes).abs().mean(1, keepdim=True), _PATCH, 1, _PATCH // 2, count_include_pad=False
+        (warped - colors).abs().mean(1, keepdim=True), _PATCH, 1, _PATCH // 2, count_include_pad=False
     )[:, 0]
     difference = difference.flatten(1).masked_fill(~is_seen, torch.inf).amin(0)
-    grey = planes.mean(0)[None]
+    grey = colors.mean(0)[None]
     mean, square = (
         avg_pool2d(values, _PATCH, 1, _PATCH // 2, count_include_pad=False) for values in (grey, grey**2)
     )
     textured = ((square - mean**2).clamp(min=0).sqrt() > _TEXTURED).flatten()
-    return difference[textured & difference.isfinite()]
+    return difference[textured]
 
 
 def leaning(

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
+from dataclasses import replace
+from itertools import combinations
 
 import torch
 from torch import Tensor
 
+from forewarp.data.agreement import BESIDE, COMPARED, likeliest, small_image, sweep_error
 from forewarp.data.cameras import IN_PIXELS, WIDEST, degrees_of, nine_pixels
-from forewarp.data.directions import common_point
+from forewarp.data.directions import common_point, readings_of
 from forewarp.data.files import SceneError, mismatch
 from forewarp.data.images import by
 from forewarp.data.names import hexadecimal, in_order, read_names
@@ -78,6 +81,8 @@ def remarks(scene: Scene) -> Iterator[str]:
         line = f"all test times, {min(beyond):.4g} to {max(beyond):.4g}, lie outside training's"
         advice = "of which alone motion is learnt; give images of one moment one time"
         yield f"{line}, {first:.4g} to {last:.4g}, {advice}"
+    if not aside and aim is None and scene.has_one_camera and not scene.has_alpha:
+        yield from _turned_poses(scene)
     walk = None if aside else walk_of(scene)
     if walk is not None and (walk[0] < _WALKED or (walk[1] or _SLOW) < _SLOW):
         speed = "" if walk[1] is None else f", {walk[1]:.2g} a second"
@@ -201,6 +206,37 @@ def _aimed(scene: Scene, aim: Tensor) -> Iterator[str]:
         if float(beyond.double().mean()) > _FEW:
             distance, at = (_length(scene, float(values.median())) for values in (away, bound))
             yield f"{point} is {distance} away, with {key} at {at}; {_remedy(scene, key)}"
+
+
+def _turned_poses(scene: Scene) -> Iterator[str]:
+    """Say that images of a film agree much better with poses or focal lengths in another way."""
+    frames = sorted(scene.train, key=lambda frame: frame.time)
+    steps = [max(least, len(frames) // share) if share else 0 for share, least in BESIDE]
+    groups = [[frames[i + n] for n in steps if i + n < len(frames)] for i in spread(len(frames), COMPARED)]
+    pairs = [pair for group in groups for pair in combinations(group, 2)]
+    images = {id(frame): small_image(frame.load()) for group in groups for frame in group}
+
+    def errors(read: Callable[[Camera], Camera]) -> list[float]:
+        cameras = {}
+        for pair in pairs:
+            for frame in pair:
+                height, width = images[id(frame)].shape[:2]
+                camera = read(scene.world.camera_to_data(replace(frame.camera, lens=None)))  # as it is slow
+                cameras[id(frame)] = camera.resized(width, height)
+        keys = [[id(frame) for frame in pair] for pair in pairs]
+        return [sweep_error(cameras[a], images[a], cameras[b], images[b]) for a, b in keys]
+
+    changes = readings_of(scene.protocol.get("dataset"))
+    readings = {
+        how: lambda c, change=change: replace(c, camera_to_world=change(c.camera_to_world[None])[0])
+        for how, change in changes.items()
+    }
+    for factor in (0.5, 2.0):
+        key = f"if focal lengths are {factor:g} times as long"
+        readings[key] = lambda c, by=factor: replace(c, fx=by * c.fx, fy=by * c.fy)
+    how = likeliest(errors(lambda camera: camera), {how: errors(read) for how, read in readings.items()})
+    if how is not None:
+        yield f"neighbouring images agree much better {how}; compare poses and focal lengths with others"
 
 
 def _remedy(scene: Scene, key: str) -> str:

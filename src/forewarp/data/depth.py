@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from forewarp.data.agreement import leaning, likeliest_reading, plane_error, small_image
+from forewarp.data.agreement import BESIDE, COMPARED, leaning, likeliest_reading, plane_error, small_image
 from forewarp.data.arrays import check_shape, load_numpy
 from forewarp.data.files import existing, mismatch
 from forewarp.data.images import CACHE, by, read_gray16, read_image
@@ -35,11 +35,8 @@ _NOWHERE = 10.0  # multiple of far, beyond which nothing is measured
 _REPEATED, _SEVERAL = 0.002, 2  # share and number of pixels of the largest depth, from which on it is none
 _BELOW, _STANDS_OUT = 0.02, 5  # share below the largest, and how many times as often as any depth there it is
 _PLACED = 2e-3  # share by which the largest depths of views contradict each other if they are none
-_COMPARED, _BESIDE = (
-    3,
-    ((0, 0), (24, 2), (8, 6)),
-)  # views whose colours are compared, with others: share, least
-SHOWN = 128  # pixels of the longer side of these
+_COLORED = 6  # groups of views whose colours are compared, at most
+SHOWN = 128  # pixels of the longer side of views whose colours are compared
 _UNITS = (1.0, MILLIMETRES, 1e-2, 1e2, 1e3, 2e-4, 1 / 256, 0.0254, 0.3048)  # that depth is written in
 _SAME_UNIT = 0.03
 _DOUBTED = 0.5  # confidence above which some depths are
@@ -370,10 +367,10 @@ def _doubt_colors(
         groups: of frames that are compared; of films others are.
     """
     if usual == "axis":
-        beside = [max(least, len(frames) // share) if share else 0 for share, least in _BESIDE]
-        firsts = spread(len(frames), _COMPARED)
+        beside = [max(least, len(frames) // share) if share else 0 for share, least in BESIDE]
+        firsts = spread(len(frames), COMPARED)
         groups = [[frames[i + n] for n in beside if i + n < len(frames)] for i in firsts]
-    views = {}
+    groups, views = groups[:_COLORED], {}
     for frame in {id(frame): frame for group in groups for frame in group}.values():
         image = small_image(frame.load(), SHOWN)
         camera = frame.camera.resized(image.shape[1], image.shape[0])

@@ -148,6 +148,22 @@ _HALVES = {
 }
 
 
+_OF_KEYS = {
+    "if read with data.inverse=true": _KEYS["data.inverse=true"],
+    "if read with data.axes=opencv": opposite,
+    "if read with data.inverse=true data.axes=opencv": lambda poses: opposite(
+        _KEYS["data.inverse=true"](poses)
+    ),
+    "if rotations are transposed": _HALVES["rotations are transposed"],
+}
+_OF_FILES = {"if orientations are transposed": transposed, "if their axes are OpenGL's": opposite}
+
+
+def readings_of(dataset: str) -> Mapping[str, _Change]:
+    """Return in which other ways a film's poses may be written in a format, each with what to say of it."""
+    return _OF_KEYS if dataset in ("video_with_poses", "dnerf") else _OF_FILES
+
+
 def common_point(poses: Sequence[torch.Tensor]) -> torch.Tensor | None:
     """Return the point (3,) that nearly all cameras look at, float64; None where there is none.
 

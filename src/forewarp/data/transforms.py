@@ -180,6 +180,11 @@ def unread_beside(
     if key := _cameras_elsewhere(content):
         advice = "write fl_x, fl_y, cx, cy and the lens of its camera into each frame"
         lines.append(f"{file}: {key}: not read, which seems to be of each camera; {advice}")
+    own = dict.fromkeys(key for entry in entries for key in entry.own if key not in _FOCAL)
+    own = [key for key in own if _LIKE_FOCAL.fullmatch(key) or _LIKE_ANGLE.fullmatch(key)]
+    if own:
+        advice = "call a focal length in pixels fl_x, an angle in radians camera_angle_x"
+        lines.append(f"{file}: frames: {own[0]}: not read, which seems to be of the camera; {advice}")
     cut = [key for key in keys if _CUT_OUT.fullmatch(key) and any(is_said(e.get(key)) for e in entries)]
     if cut:
         advice = "cut the subject out by alpha, or name masks by mask_path and set data.masks=alpha"
