@@ -138,6 +138,7 @@ def test_several_numbers_of_one_camera_order_one_film(names, times):
         in_groups("frame_{1:04d}_cam{0:02d}", range(3), range(9)),
         in_groups("{}_{:05d}", range(3), range(40)),
         in_groups("day{:02d}_{:02d}", (1, 5), range(4)),  # how long between them?
+        ["01-05-23", "02-05-23", "01-06-23"],
         [f"{s}_{f:02d}" for s, f in ((0, 3), (0, 20), (1, 17), (1, 22), (2, 13), (3, 1))],
         [f"{day:02d}-{month:02d}" for month in (10, 11) for day in range(1, 30)],
     ],
@@ -214,6 +215,7 @@ def test_cameras_beside_each_other_that_move_on_are_a_rig():
         (["cap_235000", "cap_235900", "cap_001000"], "times of day more than half a day apart"),
         (["11-50-00 PM", "11-59-00 PM", "12-10-00 AM"], "times of day more than half a day apart"),
         (["01.11.2023", "05.12.2023", "03.12.2023", "02.12.2023"], "begin with the day, or .* the month"),
+        (["01.11.2023", "05.12.2023", "03.12.2023"], "begin with the day, or .* the month"),
         (["x_101112", "x_101130", "x_101205", "x_101231"], "times of day, or dates that begin with two"),
         (["a_1.3", "a_1.9", "a_1.11", "a_2.12"], "seconds with a fraction, or a counter"),
         ([f"20231104_10111{s}_{f}" for s, f in ((2, 345), (3, 410), (4, 777))], "fractions of the seconds"),
@@ -268,6 +270,10 @@ def test_a_pattern_settles_every_case():
     assert read_names(clocks, "t.json", "_(?P<time>.*)").frames == [36359, 36361.5, 7]
     dated = read_names(["2024-05-01 23.59.59", "2024-05-02 00.00.01"], "t.json", "(?P<time>.*)")
     assert np.diff(dated.frames) == [2]
+    days = read_names(["01.11.23", "01.12.23"], "t.json", r"(?P<day>\d+)\.(?P<month>\d+)\.(?P<year>\d+)")
+    assert np.diff(days.frames) == [30 * 86400]
+    seconds = read_names(["1m02.5", "2m03"], "t.json", r"(?P<minute>\d+)m(?P<second>[\d.]+)")
+    assert np.diff(seconds.frames) == [60.5]
 
 
 @pytest.mark.parametrize(
@@ -277,6 +283,7 @@ def test_a_pattern_settles_every_case():
         ("[0-9]+", "a group named time or frame, .* but got neither"),
         (r"x(?P<frame>\d+)", "to be found in every name of t.json, but got not in '0_004'"),
         (r"_(?P<frame>\d+)", "each frame once, but got 4 again in '1_004'; name the camera by a group"),
+        (r"(?P<month>\d)_\d+", "group month: expected a number, but got '0' of '0_004'"),
         (r"(?P<frame>_)", "group frame: expected a number, but got '_' of '0_004'"),
     ],
 )

@@ -260,6 +260,7 @@ def test_times_that_miss_0_and_1_by_rounding_are_not_scaled():
         ([i / 9 for i in range(10)], range(16), r"train frames: expected one unit .* 0 to 15, .* 0 to 1 \("),
         ([0, 0.2, -1, 0.6, 0.8], [0.5, 1], "train/2: expected a time near all others, 0 to 1, .* -1;"),
         ([*range(20), -99], [20], "time of train/20: expected a time near all others, 0 to 20, but got -99;"),
+        ([*[-1] * 10, *(i / 20 for i in range(20))], [1], "train/0: expected .* 0 to 1, but got -1;"),
         ([*(i / 20 for i in range(20)), 5], [1], "time of train/20: expected .* 0 to 1, but got 5;"),
     ],
 )

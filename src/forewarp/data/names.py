@@ -18,7 +18,7 @@ import numpy as np
 from forewarp.data.files import SceneError, mismatch
 
 KEY = "set data.name_pattern (of forewarp-capture: name_pattern) to a regular expression with a group"
-KEY += " 'frame' or 'time', and 'camera' for a rig"
+KEY += " 'frame' or 'time', or 'year', 'month', 'day', and 'camera' for a rig"
 # A number in a name; between zero bytes stands one that several parts of a name say together.
 _NUMBER = "(\0[^\0]+\0|\\d+)"
 _DECIMAL = "(\0[^\0]+\0|(?<!\\d)\\d\\d\\.\\d{3}(?!\\.?\\d)|(?<![\\d.])\\d+(?:\\.\\d+)?(?!\\.?\\d))"
@@ -35,17 +35,17 @@ _APART += rf"(?:{_HALF})?(?!\d)"
 _OF_DATE = {"Y": r"(?P<Y>(?:19|20)\d\d)", "y": r"(?P<y>[0-4]\d)", "m": r"(?P<m>\d\d)", "d": r"(?P<d>\d\d)"}
 
 
-def _date(order: str, behind: str = r"(?!\d)") -> re.Pattern:
-    """Make the pattern of a date, ``order`` as ``dmY``, and what stands ``behind`` it."""
+def _date(order: str, behind: str, between: str = r"[-_.]|(?<=\d\d)") -> re.Pattern:
+    """Make the pattern of a date, ``order`` as ``dmY``, of what is ``between`` its parts and ``behind``."""
     first, second, third = (_OF_DATE[part] for part in order)
     if order in ("dmY", "mdY"):  # 4.11.2023
         first, second = (part.replace(r"\d\d", r"\d\d?") for part in (first, second))
-    return re.compile(rf"(?<![\d\0]){first}(?P<sep>[-_.]|(?<=\d\d)){second}(?P=sep){third}{behind}")
+    return re.compile(rf"(?<![\d\0]){first}(?P<sep>{between}){second}(?P=sep){third}{behind}")
 
 
 _TIME_OF_DAY, _COUNTER = "times of day", "a counter"
-_WITH_TIME = (rf"(?: at |,? |[-_T.])?{_PACKED}", rf"(?: at |,? |[-_T.]){_APART}", r"(?!\d)")
-_DATED = [_date("Ymd", behind) for behind in _WITH_TIME[:2]]  # which nothing else can be
+_WITH_TIME = rf"(?: at |,? |[-_T.])?{_PACKED}", rf"(?: at |,? |[-_T.]){_APART}"
+_DATED = [_date("Ymd", behind) for behind in _WITH_TIME]  # which nothing else can be
 _FRAME_WORD = re.compile(r"(?i)(?:^|[^a-z])(frame|time|t)[_-]?$")
 _CAMERA_WORD = re.compile(r"(?i)(?:^|[^a-z])(cam|camera|view|sensor|c|v)[_( -]*$")
 _LETTER_WORD = re.compile(r"(?i)(?:^|[^a-z])[cv][_( -]*$")  # before two digits at most: C0001 is a clip
@@ -69,6 +69,8 @@ _EVEN, _UNEVEN = 0.5, 4.0  # longest step by the shortest, less 1: at most, time
 _SAME_TIMES = 0.25  # of the shortest step, by which times of two readings may differ that mean one thing
 _RATES = (24, 25, 30, 50, 60)  # frames a second of time codes
 _SHORT = 0.25  # of the time since a clock began, that a film lasts at most
+_CALENDAR = ("year", "month", "day", "hour", "minute", "second")  # groups of a pattern
+_LEAST_STEPS = 5  # which are even by no chance
 _MOST_DIGITS = 40  # of a time with its fraction
 _SKIPPED = 4  # numbers at most that time codes leave out at the beginning of a minute
 _CARRY = 3.0  # steps of the last number from its end and its beginning within which it is carried over
@@ -130,7 +132,7 @@ def _instant(match: re.Match) -> float | None:
     """
     part = match.groupdict()
     is_whole = part["sep"] or len(part["m"]) + len(part["d"]) == 4
-    is_short = part.get("y") and (part["sep"] if not part.get("H") else not part["S"])
+    is_short = part.get("y") and part.get("H") and not part["S"]
     if not is_whole or is_short:
         return None
     year = int(part.get("Y") or 2000 + int(part["y"]))
@@ -173,12 +175,20 @@ _ORDERS = {
     "mdy": "dates that begin with the month and end with two digits of the year",
 }
 _TIME_CODE = re.compile(r"(?<![\d\0])(\d\d)(\d\d)(\d\d)(\d\d)(?!\d)")
+# What three numbers of two digits, one after the other, may be, too.
+_CHAINS = [
+    (what, _date(order, r"(?!\d)", "[-_.]"), _instant) for order, what in _ORDERS.items() if "y" in order
+]
 _APART_CODE = re.compile(r"(?<!\d)\d\d([-_.:])\d\d\1\d\d[-_.:;]\d\d(?!\d)")
 # What numbers of a name may say together, and how it is read.
 _FORMS: list[tuple[str, re.Pattern, Callable[[re.Match], float | None]]] = [
     (_TIME_OF_DAY, re.compile(rf"(?<![\d\0])(?=\d{{6}}){_PACKED}"), _of_day),
     (_TIME_OF_DAY, re.compile(rf"(?<![\d\0])(?=[-_.:\d]+{_IS_HALF}){_APART}"), _of_day),
     *((what, _date(order, behind), _instant) for order, what in _ORDERS.items() for behind in _WITH_TIME),
+    *(
+        (what, _date(order, r"(?!\d)", r"[-_.]|(?<=\d\d)" if "Y" in order else ""), _instant)
+        for order, what in _ORDERS.items()
+    ),
     *((f"time codes of {rate} frames a second", _TIME_CODE, partial(_of_code, rate=rate)) for rate in _RATES),
 ]
 
@@ -245,9 +255,10 @@ def read_names(
     Args:
         names: paths of the images without suffix, ``cam01/0003``; of all splits together.
         where: what the names are of, for errors.
-        pattern: regular expression with a group ``time`` (a number, or a time of day as 10-05-30) or
-            ``frame``, and ``camera`` for a rig, ``part`` for films one after the other, that is found in
-            every name; None: see the rules below.
+        pattern: regular expression with a group ``time`` (a number, or a time of day as 10-05-30),
+            ``frame``, or ``year``, ``month``, ``day``, ``hour``, ``minute`` and ``second`` (any of them),
+            and ``camera`` for a rig, ``part`` for films one after the other, that is found in every name;
+            None: see the rules below.
         views: a row of numbers for each image, near where cameras stand and look alike, such as their
             positions; they tell cameras of a rig from parts of one film.
         one_camera: took all images: several numbers are of one film.
@@ -314,6 +325,8 @@ def _by_pattern(names: Sequence[str], where: str, pattern: str) -> NameNumbers:
     except (re.error, TypeError) as error:
         raise mismatch("data.name_pattern", "a regular expression", f"'{pattern}' ({error})") from None
     groups = [name for name in ("time", "frame") if name in compiled.groupindex]
+    calendar = [name for name in _CALENDAR if name in compiled.groupindex]
+    groups += calendar[-1:]
     if len(groups) != 1:
         got = " and ".join(groups) or "neither"
         raise mismatch("data.name_pattern", "a group named time or frame, as (?P<frame>[0-9]+)", got)
@@ -322,8 +335,8 @@ def _by_pattern(names: Sequence[str], where: str, pattern: str) -> NameNumbers:
         missed = names[matches.index(None)]
         raise mismatch("data.name_pattern", f"to be found in every name of {where}", f"not in '{missed}'")
     texts = [match[groups[0]] or "" for match in matches]
-    frames = [_number_of(text) for text in texts]
-    if not all(map(math.isfinite, frames)) and all(map(_HEXADECIMAL.fullmatch, texts)):
+    frames = [*map(_of_calendar, matches)] if calendar else [_number_of(text) for text in texts]
+    if not calendar and not all(map(math.isfinite, frames)) and all(map(_HEXADECIMAL.fullmatch, texts)):
         frames = [float(int(text, 16)) for text in texts]
     for name, match, frame in zip(names, matches, frames):
         if not math.isfinite(frame):
@@ -457,7 +470,8 @@ def _survivor(readings: Mapping[str, Sequence[float]], name: str, where: str) ->
     ranked = sorted(readings, key=lambda what: _unevenness(readings[what]))
     best = _unevenness(readings[ranked[0]])
     rest = [what for what in ranked[1:] if not _agree(readings[ranked[0]], readings[what])]
-    if best <= _EVEN and all(_unevenness(readings[what]) > _UNEVEN * best + 0.05 for what in rest):
+    tells = best <= _EVEN and len({*readings[ranked[0]]}) > _LEAST_STEPS
+    if tells and all(_unevenness(readings[what]) > _UNEVEN * best + 0.05 for what in rest):
         return ranked[0]
     raise _two_ways(where, name, ", or ".join((first, *differ)))
 
@@ -474,6 +488,20 @@ def _agree(one: Sequence[float], other: Sequence[float]) -> bool:
     first, second = ((values - values.min()) / (np.ptp(values) or 1) for values in both)
     steps = [np.diff(np.unique(values)).min(initial=1) for values in (first, second)]
     return float(np.abs(first - second).max()) <= _SAME_TIMES * min(steps)
+
+
+def _of_calendar(match: re.Match) -> float:
+    """Return the seconds that the groups year, month .. second of a pattern say; NaN where there is no such
+    date.
+    """
+    part = {key: text for key, text in match.groupdict().items() if text}
+    hour, minute, second = (_number_of(part.get(key, "0")) for key in _CALENDAR[3:])
+    try:
+        year, month, day = (int(part.get(key, 1)) for key in _CALENDAR[:3])
+        date = datetime(year + 2000 * (year < 100), month, day, tzinfo=timezone.utc)
+    except ValueError:
+        return math.nan
+    return date.timestamp() + (hour * 60 + minute) * 60 + second
 
 
 def _with_fractions(names: Sequence[str], where: str) -> Sequence[str]:
@@ -646,6 +674,13 @@ def _chosen(
         times = _ranked(rows, order)
         if times is None and must_tell:
             raise _two_ways(where, name, f"{together}, and not how much time lies between its parts")
+        if must_tell:
+            readings = {together: times}
+            for what, pattern, read in _CHAINS:
+                matches = [pattern.search("".join(row)) for row in rows]
+                values = [None if match is None else read(match) for match in matches]
+                readings |= {} if None in values or len({*values}) == 1 else {what: values}
+            times = readings[_survivor(readings, name, where)]
         keys = [tuple(float(row[i]) for i in order) for row in rows]
         ranks = {key: float(rank) for rank, key in enumerate(sorted({*keys}))}
         return _Reading(together, times or [ranks[key] for key in keys], parts)

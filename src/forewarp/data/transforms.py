@@ -75,7 +75,7 @@ _OWN_NUMBERS = 0.5  # share of training's span that frames of an own numbering l
 _LEAST_UNIT = 0.5  # of all times, that those in [0, 1] span
 _ROUNDING = 1e-6  # beyond 0 and 1
 _FEW = 0.1  # share of the frames, one at least, whose times are in doubt where those of all others agree
-_LEAST_FRAMES = 6  # from which on their order tells
+_LEAST_FRAMES = 4  # from which on their order tells
 _APART = 3.0  # longest steps of all other times, by which one is far from them
 
 
@@ -645,7 +645,9 @@ def check_times(
         away = {name: max(rest[0] - t, t - rest[-1]) for name, t in named.items()} if len(rest) > 2 else {}
         odd = [name for name, distance in away.items() if distance > 0]
         name = max(odd, key=away.get, default="")
-        if 0 < len(odd) <= max(1, _FEW * len(named)) and away[name] > _APART * np.diff(rest).max():
+        stand_for_none = len({named[name] for name in odd}) == 1 and named[odd[0]] < 0
+        are_few = 0 < len(odd) <= max(1, _FEW * len(named)) or stand_for_none
+        if are_few and away[name] > _APART * np.diff(rest).max():
             expected = f"a time near all others, {rest[0]:.10g} to {rest[-1]:.10g}"
             raise mismatch(f"{where}: time of {name}", expected, f"{named[name]:.10g}", advice)
     for split, of in splits.items():
