@@ -102,6 +102,20 @@ def test_places_are_those_of_the_data(particles, tmp_path, kind, world):
         assert about.get(key) == (pytest.approx(before[key] / world.scale) if key in before else None)
 
 
+@pytest.mark.parametrize("kind", ["ply", "usd", "mesh"])
+def test_turned_places_turn_back_by_the_rotation_of_about(particles, tmp_path, kind):
+    if kind == "usd":
+        pytest.importorskip("pxr")
+    as_it_is = exporter(kind)(particles, tmp_path / "world", **OPTIONS[kind] | {"up": "world"})
+    turned = exporter(kind)(particles, tmp_path / "turned", **OPTIONS[kind] | {"up": "y"})
+    before, after = (np.array(about["rotation"]) for about in (as_it_is, turned))
+    assert not np.allclose(after, np.eye(3))
+    frame = "frames/frame_0001.ply"  # canonical.ply is not turned
+    read = {"ply": lambda folder: vertices(folder / frame), "usd": lambda folder: of_usd(folder)[:-2]}
+    places, back = (read.get(kind, of_mesh)(tmp_path / name) for name in ("world", "turned"))
+    np.testing.assert_allclose(back @ after, places @ before, atol=1e-4)
+
+
 def test_every_format_has_a_test_of_its_places():
     assert PLACES.keys() | {"html"} == FORMATS.keys()  # html holds a scene.glb
 

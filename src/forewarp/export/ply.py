@@ -202,7 +202,7 @@ def export_ply(
         for file, places in zip(files, tracks.positions @ rotation.T.float()):
             write_ply(file, {"vertex": point_columns(places, tracks.colors[0])}, comments=comments)
         facts = {"points": len(tracks), "kind": "points of the surface"}
-        return facts | {"colors": "sRGB, 8 bits, as in the images", "up": up}
+        return facts | {"colors": "sRGB, 8 bits, as in the images", "up": up, "rotation": rotation.tolist()}
     template = source.method.template().in_data(world)
     own_degree = math.isqrt(template.harmonics.shape[1]) - 1
     degree = min(degree, own_degree) if compressed else degree
@@ -221,7 +221,7 @@ def export_ply(
         about = {"times": np.array(source.times, np.float32), "shift": np.array(source.shift)}
         np.savez(folder / "motion.npz", **about, **motion)
     kind = "Gaussian splats, compressed" if compressed else "Gaussian splats"
-    facts = {"particles": len(template), "kind": kind, "up": up}
+    facts = {"particles": len(template), "kind": kind, "up": up, "rotation": rotation.tolist()}
     facts |= {"degree": degree, "degree of the run": own_degree}
     colors = "sRGB, as in the images: 1/2 + 0.28209479177387814 f_dc is the mean over directions"
     return facts | {"colors": colors}
@@ -368,6 +368,7 @@ def export_mesh(
         vertex_counts.append(len(vertices))
         face_counts.append(len(faces))
         progress(number + 1, len(source.times))
-    facts = {"vertices": vertex_counts, "faces": face_counts, "level": level, "up": up}
+    facts = {"vertices": vertex_counts, "faces": face_counts, "level": level}
+    facts |= {"up": up, "rotation": rotation.tolist()}
     colors = "sRGB, as in the images, the mean over directions"
     return facts | {"spacing": lattice.spacing[0] / world.scale, "colors": colors}

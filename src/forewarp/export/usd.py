@@ -102,8 +102,9 @@ def export_usd(
         raise disk_error(str(error), file) from error
     facts = {"particles": len(clouds[0]["positions"]), "degree": degree, "degree of the run": own_degree}
     facts |= {"seconds": seconds, "sampled": sampled, "off between times": off_between(source)}
-    turned = "" if rotation is None else ", turned from the data's world"
+    turned = "" if rotation is None else ", turned from the data's world by rotation"
     colors = "sRGB, as in the images: 1/2 + 0.28209479177387814 of the first coefficient is the mean"
+    facts["rotation"] = torch.eye(3).tolist() if rotation is None else rotation.tolist()
     return facts | {"axes in the file": f"{axis} up{turned}", "colors": colors}
 
 
