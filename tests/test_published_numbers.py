@@ -197,7 +197,7 @@ def test_faults_of_the_released_code_are_on_in_faithful_and_off_in_fast(model):
 
 # The paper's method by the place where it is printed: sections 3 and 4, and appendices A.2, A.4 and A.5.
 WEIGHTS_FORWARD = {"photo": 1, "flow_l1": 1e-5, "tv_density": 1e-6, "tv_flow": 1e-3, "tv_depth": 1e-1}
-NONE_PRINTED = {"static_points": 0, "moving_opacity": 0, "rigid": 0}
+NONE_PRINTED = {"static_points": 0, "moving_opacity": 0}
 ENTROPIES = {"coarse": {"point_color": 1e-1, "background_entropy": 1e-2, "inpaint_diff": 0}}
 ENTROPIES["fine"] = {"point_color": 1e-2, "background_entropy": 1e-3, "inpaint_diff": 1e-5}
 RATES = {"grid": 1e-1, "network": 1e-3, "flow": 1e-3} | dict.fromkeys(("density", "color", "shading"), 1e-1)

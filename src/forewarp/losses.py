@@ -77,24 +77,6 @@ def tv_flow(flow: Tensor, pairs: list[tuple[Tensor, Tensor]]) -> Tensor:
     return total_variation(flow, pairs)
 
 
-def strain(flow: Tensor, corners: Tensor, spacing: Tensor) -> Tensor:
-    """Mean square of Green's strain ``F^T F - 1`` of a flow, which is 0 where it moves matter rigidly.
-
-    ``F = 1 + J``, J the flow's slopes by forward differences; all is summed over the nine entries.
-
-    Args:
-        flow: (M, 3), world units.
-        corners: (E, 4) int64, rows of a place and of its neighbours along x, y and z: ``cell_corners``.
-        spacing: (3,), distance to these neighbours, world units.
-    """
-    if not len(corners):
-        return flow.sum() * 0.0
-    here, *others = (flow.index_select(0, rows) for rows in corners.unbind(-1))
-    slopes = torch.stack([(there - here) / step for there, step in zip(others, spacing)], -1)  # (E, 3, 3)
-    turned = slopes.transpose(1, 2)
-    return (slopes + turned + turned @ slopes).square().sum((1, 2)).mean()
-
-
 def tv_depth(depth: Tensor, opacity: Tensor) -> Tensor:
     """w7: RegNeRF's depth smoothness on patches (B, S, S) from random views; depth in units of far - near."""
     return patch_variation(depth, opacity)

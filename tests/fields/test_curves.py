@@ -3,7 +3,6 @@
 import pytest
 import torch
 
-from forewarp import losses
 from forewarp.fields.curves import Curve, TrajectoryField
 from forewarp.fields.grids import VoxelGrid
 from forewarp.scene.box import Box, Lattice
@@ -159,15 +158,3 @@ def test_nodes_are_as_far_apart_in_a_smaller_box():
 def test_refuses_coefficients_of_nothing(changes, text):
     with pytest.raises(ValueError, match=text):
         TrajectoryField(BOX, bases=3, frames=8, canonical_time=0.3, **changes)
-
-
-@pytest.mark.parametrize("changes", [{"nodes": 8}, {"nodes": 0}, {"kind": "nodes", "nodes": 8}])
-def test_what_is_measured_for_strain_is_the_flow(changes):
-    moving, grid = TrajectoryField(BOX, bases=3, frames=8, canonical_time=0.3, **changes), voxels()
-    for parameter in moving.parameters():
-        torch.nn.init.normal_(parameter, std=0.1)
-    flow, corners, spacing = moving.beside(grid, 0.9)
-    assert len(flow) > int(corners.max())
-    lattice = moving.lattice if moving.at_nodes else LATTICE
-    torch.testing.assert_close(spacing, torch.tensor(lattice.spacing))
-    assert losses.strain(flow, corners, spacing) > 0

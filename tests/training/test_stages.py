@@ -72,7 +72,6 @@ def test_a_run_with_learned_nodes_and_rays_near_matter_continues_to_the_bit(tmp_
             "model": nodes,
             "near_share": 0.7,
             "carry": carry,
-            "weights": {"photo": 1.0, "rigid": 1e-2},
         }
         straight = run(tmp_path / carry, **options).fit()
         counts = straight.method.motion.trajectory.learned

@@ -14,7 +14,7 @@ from forewarp.fields.networks import mlp
 from forewarp.ops.backend import check_value
 from forewarp.ops.curves import dct_basis, spline_basis, spline_shares
 from forewarp.ops.encode import positional_encoding
-from forewarp.ops.grid import cell_corners, corner_weights, index_of, trilinear
+from forewarp.ops.grid import corner_weights, index_of, trilinear
 from forewarp.scene.box import Box, Lattice
 
 KINDS = ("spline", "cosines")
@@ -156,7 +156,6 @@ class TrajectoryField(nn.Module):
         # Of the grid that was asked for last: its voxels, their places, and the nodes around them.
         self._nodes: tuple[Tensor, Tensor, tuple[Tensor, Tensor, Tensor]] | None = None
         self._followed: Tensor | None = None  # the voxels that the learned nodes are around
-        self._corners: tuple[Tensor, Tensor] | None = None  # see beside
 
     def play(self, bases: float | None) -> int:
         """Use the first ``bases`` bases, all for None; return their number."""
@@ -197,21 +196,6 @@ class TrajectoryField(nn.Module):
             return _matmul(self.coefficients(points), self.basis(time))
         at_nodes, index = self._at_nodes(nodes, index, time)
         return trilinear(at_nodes, index, coordinates, at_nodes.new_zeros(3))
-
-    def beside(self, grid: VoxelGrid, time: float) -> tuple[Tensor, Tensor, Tensor]:
-        """Return what ``losses.strain`` asks of the motion of a grid's voxels at a time: the flow (M, 3) at
-        the nodes, without nodes at the voxels; rows (E, 4) of neighbours; and their distances (3,).
-
-        Cost: that of ``flow``.
-        """
-        if self.at_nodes:
-            _, (nodes, index, _) = self._around(grid)
-            (flow, index), lattice = self._at_nodes(nodes, index, time), self.lattice
-        else:
-            flow, index, lattice = self.flow(grid, time), grid.index, grid.lattice
-        if self._corners is None or self._corners[0] is not index:
-            self._corners = index, cell_corners(index)
-        return flow, self._corners[1], flow.new_tensor(lattice.spacing)
 
     def _at_nodes(self, nodes: Tensor, index: Tensor, time: float) -> tuple[Tensor, Tensor]:
         """Return the flow (M, 3) at nodes (M, 3) at a time, and which row is whose: of learned ones, all."""

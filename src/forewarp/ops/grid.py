@@ -155,16 +155,6 @@ def neighbour_pairs(index: Tensor) -> list[tuple[Tensor, Tensor]]:
     return pairs
 
 
-def cell_corners(index: Tensor) -> Tensor:
-    """Return rows (E, 4) int64 of present voxels, and of their next neighbours along x, y and z; only voxels
-    with all three.
-    """
-    x, y, z = (n - 1 for n in index.shape)
-    corners = [index[:x, :y, :z], index[1:, :y, :z], index[:x, 1:, :z], index[:x, :y, 1:]]
-    rows = torch.stack([corner.reshape(-1) for corner in corners], -1)
-    return rows[(rows >= 0).all(-1)].long()
-
-
 def block_sums(image: Tensor, by: int = 2) -> Tensor:
     """Sum each block of ``by`` x ``by`` pixels: (H, W, ...) -> (H / by, W / by, ...). Differentiable.
 

@@ -277,8 +277,6 @@ def test_refuses_by_the_name_of_the_key(call, text):
 
 
 PATCHES = torch.rand(2, 4, 4, generator=torch.Generator().manual_seed(3)), torch.ones(2, 4, 4)
-CORNERS = torch.tensor([[0, 1, 2, 3]])
-BESIDE = torch.randn(5, 3, generator=torch.Generator().manual_seed(4)), CORNERS, torch.ones(3)
 STRAY = torch.randn(7, 3, generator=torch.Generator().manual_seed(3))
 TRUTH = torch.rand(4, 3, generator=torch.Generator().manual_seed(9))
 
@@ -296,7 +294,6 @@ def terms_of(renderings, literal=(), **on):
     torch.nn.init.normal_(method.radiance.density)
     method.printed, method._patches_of = frozenset(literal), lambda *_: PATCHES
     method._stray = lambda *_: STRAY if on else None
-    method.motion.trajectory.beside = lambda *_: BESIDE
     canonical = method.radiance()
     state = VoxelSnapshot(
         Moment(0.5), {}, canonical, method.renderer, length=0.5, **{k: v(canonical) for k, v in on.items()}
@@ -325,7 +322,6 @@ def test_every_term_is_the_pure_function_of_its_parts():
         "inpaint_diff": losses.inpaint_diff(state.inpaint_difference),
         "tv_density": sum(losses.tv_density(g.raw_density, pairs) for g in (grid, state.background)),
         "tv_flow": losses.tv_flow(flow, pairs),
-        "rigid": losses.strain(*BESIDE),
         "tv_depth": losses.tv_depth(*PATCHES),
         "static_points": losses.static_points(STRAY),
         "moving_opacity": losses.moving_opacity(grid.activation.alpha(grid.raw_density, grid.voxel_size)),
@@ -334,7 +330,7 @@ def test_every_term_is_the_pure_function_of_its_parts():
 
 
 def test_terms_of_effects_that_are_off_are_left_out():
-    off = {"flow_l1", "tv_flow", "rigid", "inpaint_diff", "static_points", "moving_opacity"}
+    off = {"flow_l1", "tv_flow", "inpaint_diff", "static_points", "moving_opacity"}
     assert set(terms_of({"warped": drawn(0)})[1]) == set(VoxelMethod.terms) - off
 
 

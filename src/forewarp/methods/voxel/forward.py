@@ -150,7 +150,6 @@ class ForwardWarp(VoxelMethod):
             notes |= {
                 "motion (F2) at the nodes of a coarse lattice": self.motion.trajectory.at_nodes,
                 "learned at these nodes, without the network F2": self.motion.trajectory.learned is not None,
-                "neighbouring nodes move as rigidly as they can (rigid)": self.weights.get("rigid", 0) > 0,
                 "cosines of a longer period (padding)": self.motion.trajectory.padding > 0,
                 "matter fades where little of it is splatted (tau, fade)": True,
             }

@@ -132,7 +132,7 @@ class VoxelMethod(Method):
     """
 
     terms = ("photo", "point_color", "background_entropy", "flow_l1", "inpaint_diff", "tv_density", "tv_flow")
-    terms += ("rigid", "tv_depth", "static_points", "moving_opacity")
+    terms += ("tv_depth", "static_points", "moving_opacity")
     literal = ("photo", "point_color", "background_entropy")  # their printed form differs
     numbers = tuple(field.name for field in fields(VoxelStage) if field.name != "name")
     still_steps = 150  # a step is of rays of many images
@@ -264,7 +264,6 @@ class VoxelMethod(Method):
             shares: (R,) how often each ray counts; None: once.
         """
         seen, canonical, literal = renderings.values(), state.canonical, self.printed
-        time = state.moment.time
 
         def of(effect: Any, loss: Callable[[Any], Tensor]) -> Callable[[], Tensor | None]:
             return lambda: None if effect is None else loss(effect)
@@ -291,11 +290,8 @@ class VoxelMethod(Method):
         def tv_flow(flow: Tensor) -> Tensor:
             return losses.tv_flow(flow / state.length, self._neighbours(canonical.index))
 
-        def rigid(_: Tensor) -> Tensor:
-            return losses.strain(*self.motion.trajectory.beside(self.radiance, time))
-
         def static_points() -> Tensor | None:
-            stray = self._stray(time, generator)
+            stray = self._stray(state.moment.time, generator)
             return None if stray is None else losses.static_points(stray)
 
         def moving_opacity(_: RadianceGrid) -> Tensor:
@@ -310,7 +306,6 @@ class VoxelMethod(Method):
             "inpaint_diff": of(state.inpaint_difference, losses.inpaint_diff),
             "tv_density": tv_density,
             "tv_flow": of(state.flow, tv_flow),
-            "rigid": of(state.flow, rigid),
             "tv_depth": lambda: losses.tv_depth(*self._patches_of(state, generator)),
             "static_points": static_points,
             "moving_opacity": of(state.background, moving_opacity),
