@@ -310,6 +310,12 @@ def test_what_views_contradict_in_depths_is_a_hole_or_named(tmp_path, room, chan
         assert np.array_equal(frame.load_sensed()[0].numpy() > 0, expected)
 
 
+def test_transposed_depths_of_square_images_are_named(tmp_path):
+    square = [(camera, *shown(camera)) for camera in walk(size=(48, 48))]
+    assert "if depths are transposed; turn them" in "".join(read_room(tmp_path, square, lambda d: d.T)[1])
+    assert read_room(tmp_path, square, lambda depth: depth)[1] == []
+
+
 def test_a_limit_that_views_do_not_contradict_is_kept_and_said(tmp_path):
     cameras = walk(1) * 4  # a camera that stands still
     frames, (line,) = read_room(

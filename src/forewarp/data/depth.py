@@ -45,6 +45,7 @@ _TURNED = {  # what else may be in files of depth
     "upside down": lambda camera, away: (camera, away.flip(0)),
     "mirrored": lambda camera, away: (camera, away.flip(1)),
     "turned by half": lambda camera, away: (camera, away.flip(0, 1)),
+    "transposed": lambda camera, away: (camera, away.mT if camera.width == camera.height else away),
 }
 _TURN = "turn them as their images are"
 _FACTORS = (0.5, 0.7, 1.4, 2.0)  # by which depths may be off, where near and far allow it
