@@ -221,6 +221,7 @@ def test_cameras_beside_each_other_that_move_on_are_a_rig():
         ([f"20231104_10111{s}_{f}" for s, f in ((2, 345), (3, 410), (4, 777))], "fractions of the seconds"),
         ([f"010059{f:02d}" for f in (1, 7, 20)] + ["01010001", "01010019"], "codes of 24 frames a second"),
         ([f"f{i:06d}" for i in (3, 17, 48, 101, 122, 157)], "times of day, or a counter"),
+        ([f"{i % 65536:05d}" for i in range(65530, 65540)], "to 65535, where a counter began anew"),
         (["23-59-58", "23-59-59", "00-00-01", "00-00-02"], "names that tell times in one way"),
         ([f"{391642633 + i % 4}_{i**5 % 97 + 2}0667805286827_n" for i in range(9)], "in one way"),
         ([f"frame_{i:05d}" for i in (-50, -43, 6, 13)], "differs from image to image, as signs"),

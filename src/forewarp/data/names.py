@@ -306,6 +306,9 @@ def read_names(
     if reading is None:
         return None
     frames, told = _unrolled(reading)
+    if _may_roll(frames):
+        readings = f"numbers to {max(frames):.0f}, where a counter began anew, or with a gap"
+        raise _two_ways(where, names[0], readings)
     refuse_far(dict(zip(names, frames)), where, "number", f"rename it, or {KEY}")
     _check_groups(reading, names, where, views, any(_camera_word(rows, i) for i in places))
     if len({*frames}) < len(frames):
@@ -859,6 +862,18 @@ def _unrolled(reading: _Reading) -> tuple[list[float], str]:
     frames = [frame if frame >= after else frame + turn - skips for frame in frames]
     told = f"{reading.what}: {after:g} to {highest:g}, then {lowest:g} on, taken as a counter that began anew"
     return frames, told
+
+
+def _may_roll(frames: Sequence[float]) -> bool:
+    """Tell whether numbers begin at 0 or 1 and end at the greatest of their digits, two or more, or of 8 or
+    more bits, with a gap of more than half between.
+    """
+    numbers = sorted({*frames})
+    limits = {float(10**n - 1) for n in range(2, 10)} | {float(2**n - 1) for n in range(8, 33)}
+    if len(numbers) < 4 or numbers[0] > 1 or numbers[-1] not in limits:
+        return False
+    gaps = np.diff(numbers)
+    return gaps[0] == gaps[-1] == 1 and float(gaps.max()) > 0.5 * numbers[-1]
 
 
 def refuse_far(named: Mapping[str, float], where: str, what: str, advice: str) -> None:
