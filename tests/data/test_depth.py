@@ -293,6 +293,10 @@ def unseen(depth, number):
         (lambda depth: np.minimum(depth, 3.0), "are 3, the largest of their image, where other views do not"),
         (lambda depth: unseen(depth, depth.max()), "and the like, the largest of their image, where other"),
         (lambda depth: depth[::-1], "agree much better if depths are upside down; turn them as their images"),
+        (
+            lambda depth: np.median(depth) ** 2 / depth,
+            "if depths are disparities, 1 / depth; set data.depth_kind=",
+        ),
         (lambda depth: depth[:, ::-1], "agree much better if depths are mirrored; turn them"),
         (lambda depth: depth[::-1, ::-1], "agree much better if depths are turned by half; turn them"),
         (lambda depth: 1.4 * depth, "if depths are about 0.7 times as far; set data.depth_scale=0.7"),

@@ -361,7 +361,7 @@ def _doubt_colors(
     unit: str,
     usual: str,
 ) -> list[str]:
-    """Say in a line that colours of views agree by depths only if these are turned, or multiplied.
+    """Say in a line that colours of views agree by depths only if these are turned, multiplied or inverted.
 
     Args:
         frames, world, where, unit, usual: see ``doubt_depths``.
@@ -385,11 +385,19 @@ def _doubt_colors(
         scaled = lambda camera, away, by=factor: (camera, by * away)  # noqa: E731
         advice = unit.format(f"{factor * frames[0].load_sensed.scale / world:.2g}")
         readings[f"depths are about {factor:g} times as far"] = scaled, advice
+    inverse = "set data.depth_kind=inverse, or write depth"
+    readings["depths are disparities, 1 / depth"] = lambda camera, away: (camera, _inverted(away)), inverse
     views = [[views[id(frame)] for frame in group] for group in groups]
     how = likeliest_reading(views, {how: read for how, (read, _) in readings.items()})
     if how is None:
         return []
     return [f"{where}: colours of neighbouring views agree much better if {how}; {readings[how][1]}"]
+
+
+def _inverted(away: Tensor) -> Tensor:
+    """Return the inverse of distances (H, W), of the same median; 0 stays."""
+    middle = away[away > 0].median() if bool((away > 0).any()) else 1.0
+    return torch.where(away > 0, middle**2 / away.clamp(min=1e-9), 0.0)
 
 
 def _near_pairs(frames: Sequence[Frame]) -> list[list[Frame]]:
