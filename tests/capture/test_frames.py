@@ -1,5 +1,6 @@
 """The images of a capture: from a video, from a folder, and their masks."""
 
+import shutil
 import subprocess
 
 import imageio_ffmpeg
@@ -246,14 +247,14 @@ def test_by_default_every_frame_of_a_short_film_is_taken(tmp_path):
 
 def test_images_of_a_folder_come_in_the_order_of_their_names(tmp_path):
     (tmp_path / "p").mkdir()
-    for name in ("img 10.png", "img 2.png", "img 1.png", "img 2.jpg"):
+    for name in ("img 10.png", "img 2.png", "img 1.png", "img 3.jpg"):
         Image.new("RGB", (64, 48), (int(name[4:-4]),) * 3).save(tmp_path / "p" / name)
     (tmp_path / "p" / "notes.txt").touch()
     (tmp_path / "p" / "._img 1.png").touch()  # as macOS leaves them
     frames = taken(tmp_path, tmp_path / "p", size=32)
-    ours = ["picture_000001.png", "picture_000002.jpg", "picture_000003.png", "picture_000004.png"]
-    assert frames.times == {name: number for number, name in enumerate(ours)}
-    assert frames.originals == dict(zip(ours, ["img 1.png", "img 2.jpg", "img 2.png", "img 10.png"]))
+    ours = ["picture_000001.png", "picture_000002.png", "picture_000003.jpg", "picture_000004.png"]
+    assert frames.times == pytest.approx(dict(zip(ours, [0, 1 / 9, 2 / 9, 1])))
+    assert frames.originals == dict(zip(ours, ["img 1.png", "img 2.png", "img 3.jpg", "img 10.png"]))
     assert set(frames.sizes.values()) == {(32, 24)}
     with Image.open(frames.folder / ours[3]) as image:
         assert image.size == (32, 24)
@@ -355,8 +356,8 @@ def masks_in(folder, names, value=255, box=(0, 0, 16, 16), size=(128, 96)):
 @pytest.mark.parametrize("by_name", [True, False])
 def test_what_moves_is_black_for_the_matcher(tmp_path, by_name):
     film = write_film(tmp_path / "a.mp4", numbered(12))
-    # More masks than frames can only be meant by name.
-    names = [f"frame_{n:06d}.png" for n in range(1, 14)] if by_name else [f"{n}.png" for n in range(12)]
+    # Fewer masks than frames can only be meant by name.
+    names = [f"frame_{n:06d}.png" for n in range(1, 12)] if by_name else [f"{n}.png" for n in range(12)]
     frames = taken(tmp_path, film, masks_in(tmp_path / "masks", names))
     for name in frames.times:
         mask = np.asarray(Image.open(frames.masks / f"{name}.png"))
@@ -365,16 +366,68 @@ def test_what_moves_is_black_for_the_matcher(tmp_path, by_name):
         assert (mask == 255).sum() == 48 * 64 - 64
 
 
-def test_masks_of_all_frames_count_in_order_also_when_numbered_from_0(tmp_path):
-    film, masks = write_film(tmp_path / "a.mp4", numbered(12)), tmp_path / "masks"
+@pytest.fixture(scope="module")
+def film(tmp_path_factory):
+    """A film of 12 frames."""
+    return write_film(tmp_path_factory.mktemp("film") / "a.mp4", numbered(12))
+
+
+@pytest.mark.parametrize(
+    ("name", "frames"),
+    [
+        ("frame_{:06d}.png", range(12)),
+        ("mask{}.png", range(12)),
+        ("frame_{:06d}.png", range(13)),  # named as frames are, which count from 1
+        ("frame_{:06d}.png", range(22)),
+        ("{}_mask.png", range(12)),
+    ],
+)
+def test_a_mask_numbered_0_is_of_the_first_frame(tmp_path, film, name, frames):
+    masks = tmp_path / "masks"
     masks.mkdir()
-    for n in range(12):  # of frame n the columns up to 5 n are still
+    for n in frames:  # of frame n the columns up to 5 n are still
         mask = np.uint8(255 * (np.arange(64) >= 5 * n))[None].repeat(48, 0)
-        Image.fromarray(mask).save(masks / f"frame_{n:06d}.png")
+        Image.fromarray(mask).save(masks / name.format(n))
+        if name.endswith("_mask.png"):
+            Image.new("L", (64, 48), 255).save(masks / f"{n}.png")  # the image itself
     frames = taken(tmp_path, film, masks)
     for name in frames.times:
         still = np.asarray(Image.open(frames.masks / f"{name}.png"))[0] > 0
         assert still.sum() == 5 * (int(name[6:12]) - 1)
+
+
+@pytest.mark.parametrize(
+    ("numbers", "says"),
+    [
+        (range(1, 14), "13, of numbers 1 to 13"),
+        ([*range(5), *range(6, 13)], "12, of numbers 0 to 12"),
+        (range(2, 7), "5, of numbers 2 to 6"),
+    ],
+)
+def test_masks_of_another_number_of_frames_are_refused(tmp_path, film, numbers, says):
+    masks = masks_in(tmp_path / "masks", [f"frame_{n:06d}.png" for n in numbers])
+    with pytest.raises(ValueError, match=f"expected 12 masks, .* but got {says}"):
+        taken(tmp_path, film, masks)
+
+
+@pytest.mark.parametrize(
+    ("names", "says"),
+    [
+        (("{}.png", "{}_mask.png"), "0_mask.png and 2 more are left out, as what goes with 0.png"),
+        (("{}_color.png", "{}_depth.png"), "0_depth.png and 2 more are left out"),
+        (("rgb_{}.png", "normals_{}.png"), "normals_0.png and 2 more are left out"),
+        (("mask_{}.png",), "p: times"),  # images alone, whatever they show
+    ],
+)
+def test_files_that_go_with_images_are_left_out(tmp_path, names, says):
+    masks_in(tmp_path / "p", [name.format(n) for name in names for n in range(3)])
+    frames = taken(tmp_path, tmp_path / "p")
+    assert len(frames.times) == 3
+    assert says in frames.assumed
+    (tmp_path / "p" / names[0].format(1)).with_suffix(".jpg").write_bytes(b"")
+    shutil.rmtree(tmp_path / "work")
+    with pytest.raises(ValueError, match=r"expected one image of each name, but got .*jpg and .*png"):
+        taken(tmp_path, tmp_path / "p")
 
 
 def test_masks_of_a_folder_go_by_the_users_names(tmp_path):

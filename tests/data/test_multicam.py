@@ -328,6 +328,33 @@ def test_films_of_other_names_are_said_or_refused(folder):
     assert line.endswith("toy: left not read, as names of cameras begin with cam")
 
 
+def test_files_that_go_with_frames_are_left_out_and_twins_refused(folder):
+    for path in sorted(folder.glob("cam*/*.png")):
+        shutil.copy(path, path.with_name(f"{path.stem}_mask.png"))
+    (folder / "cam00_flow").mkdir()
+    shutil.copy(folder / "cam00/0000.png", folder / "cam00_flow")
+    scene = read_scene(folder.parent, "toy")
+    assert [tells(f.load()) for f in scene.test] == [[0, n] for n in range(6)]
+    said = [f"{folder}: cam00_flow is left out", f"{folder}/cam00: 0000_mask.png and 5 more are left out"]
+    assert [line[: len(start)] for line, start in zip(scene.protocol["assumed"], said)] == said
+    shutil.copy(folder / "cam02/0003.png", folder / "cam02/0003.jpg")
+    with refused("cam02: expected one image of each name, but got 0003.jpg and 0003.png"):
+        read_scene(folder.parent, "toy")
+
+
+def test_one_of_two_films_or_folders_of_a_camera_is_said(films, tmp_path):
+    folder = shutil.copytree(films / "toy", tmp_path / "toy")
+    shutil.copy(folder / "cam00.mp4", folder / "cam01.mov")
+    scene = read_scene(tmp_path, "toy")
+    assert [tells(f.load())[0] for f in scene.train] == [1] * 4
+    assert scene.protocol["assumed"] == [f"{folder}: cam01.mp4 is read, not cam01.mov; remove what is old"]
+    (folder / "cam01.mov").unlink()
+    for n in range(4):
+        write_image(folder / "cam00" / f"{n:04d}.png", grey(CAMERAS[0], n, 0))
+    (line,) = read_scene(tmp_path, "toy").protocol["assumed"]
+    assert line == f"{folder}: cam00/ is read, not cam00.mp4; remove what is old"
+
+
 def test_frames_counted_in_hexadecimal_need_a_pattern(folder):
     for camera in folder.glob("cam*"):
         for n, path in enumerate(sorted(camera.iterdir())):

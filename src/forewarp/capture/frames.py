@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 import re
 import shutil
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,7 +18,17 @@ import numpy as np
 import torch
 from torch.nn.functional import adaptive_max_pool2d, interpolate
 
-from forewarp.data.files import SUFFIXES, UNREAD, composed, mismatch, way_from, way_from_file
+from forewarp.data.files import (
+    SIDE,
+    SUFFIXES,
+    UNREAD,
+    beside_images,
+    composed,
+    images_alone,
+    mismatch,
+    way_from,
+    way_from_file,
+)
 from forewarp.data.images import bright, by, common_header, read_image, write_image
 from forewarp.data.names import in_order, read_names
 from forewarp.data.video import HDR, Log, decode, deinterlacing, extracted, hdr_of, hdr_unsaid
@@ -243,7 +254,7 @@ def _from_folder(folder: Path, source: Source, step: Step) -> dict:
     plainly. Alpha is kept where all images have it.
     """
     as_stored = source.colmap is not None
-    paths = images_in(source.images, as_stored)
+    paths, told = images_in(source.images, as_stored)
     if len(paths) < _MIN_IMAGES:
         got = f"{len(paths)} PNG or JPEG files" if paths else "none"
         advice = way_from(source.images)
@@ -281,6 +292,7 @@ def _from_folder(folder: Path, source: Source, step: Step) -> dict:
             progress(done, len(paths))
     if not as_stored:
         assumed = "; ".join(filter(None, [_told(bars_of(brightest), "stay: crop the pictures"), assumed]))
+    assumed = "; ".join([*told, assumed])
     in_turn = [rows[path] for path in paths]
     return _record(times, in_turn, len(paths), widths, sizes, originals, assumed=assumed)
 
@@ -291,14 +303,21 @@ def _record(times: dict, rows: list[int], found: int, widths, sizes: dict, origi
     return dict(times=times, rows=rows, found=found, edges=edges, sizes=sizes, originals=originals, **told)
 
 
-def images_in(folder: Path, deep: bool = False) -> list[Path]:
-    """List images in order, with ``deep`` also those in subfolders; other systems leave files with a leading
-    dot beside them, which are none.
+def images_in(folder: Path, deep: bool = False) -> tuple[list[Path], list[str]]:
+    """List images in order, and say in a line what is left out, see ``images_alone``.
+
+    Args:
+        folder: of images; other systems leave files with a leading dot beside them, which are none.
+        deep: list also those in subfolders.
 
     Raises:
-        ValueError: for images of HEIC, WebP and others that nothing here reads; of subfolders, where there
-            are no others.
+        ValueError: for two images of one name; for those of HEIC, WebP and others that nothing here reads; of
+            subfolders, where there are no others.
     """
+    return images_alone(_pictures_in(folder, deep), folder)
+
+
+def _pictures_in(folder: Path, deep: bool) -> list[Path]:
     files = [p for p in folder.glob("**/*" if deep else "*") if not is_hidden(p.relative_to(folder))]
     images = [p for p in files if p.suffix.lower() in SUFFIXES]
     others = sorted(p for p in files if p.suffix.lower() in UNREAD)
@@ -355,22 +374,34 @@ def write_masks(
     """Write a mask for each image, in which black is what moves and white is matched; tell whether any does.
 
     There are as many as frames in the video, or images in the folder, in order; else a mask has the name of
-    its image. A folder's images have names of the user's: there the name comes first.
+    its image, or, of a video and where one has the number 0, that of its frame from 0. A folder's images have
+    names of the user's: there the name comes first. Beside images a mask has their names, as 1_mask.png.
 
     Args:
         folder: to write to.
         masks: folder of the user's.
         sizes, rows, found, originals: as of ``Frames``.
     """
-    paths = images_in(masks, deep=True)
-    by_name = {composed(path.relative_to(masks).with_suffix("").as_posix()): path for path in paths}
+    there = _pictures_in(masks, deep=True)
+    named = {path: image for path, image in beside_images(there, masks)[1].items() if SIDE.search(path.stem)}
+    named = named or {path: path for path in images_alone(there, masks)[0]}
+    paths = list(named)
+    by_name = {composed(at.relative_to(masks).with_suffix("").as_posix()): path for path, at in named.items()}
     stems = [composed(Path(originals.get(name, name)).with_suffix("").as_posix()) for name in sizes]
     are_named, are_counted = all(stem in by_name for stem in stems), len(paths) == found
-    if not are_named and not are_counted:
+    numbers = {} if originals else _numbered(by_name)
+    from_0 = 0 in numbers and not are_counted
+    steps = np.diff(sorted(numbers)) if are_counted else []
+    lacks_one = 1 in steps and max(steps) > 1
+    are_said = are_named and (originals or len(paths) < found)  # more are of another number of frames
+    are_said = all(row in numbers for row in rows) if from_0 else are_said
+    if lacks_one or not (are_counted or are_said):
         expected = f"{found} masks, one for each frame or picture, or masks with the names of the pictures"
-        raise mismatch(masks, f"{expected} ({stems[0]}.png)", len(paths))
+        got = f"{len(paths)}{f', of numbers {min(numbers)} to {max(numbers)}' if numbers else ''}"
+        raise mismatch(masks, f"{expected} ({stems[0]}.png)", got)
     in_turn = are_counted and not (are_named and originals)  # frames may be counted from 0 or from 1
-    chosen = [paths[row] for row in rows] if in_turn else [by_name[stem] for stem in stems]
+    chosen = [by_name[stem] for stem in stems] if not in_turn and not from_0 else []
+    chosen = chosen or [paths[row] if in_turn else numbers[row] for row in rows]
     any_moves = False
     for (name, size), path in zip(sizes.items(), chosen):
         # A pixel is kept out as soon as a part of it moves.
@@ -378,6 +409,14 @@ def write_masks(
         any_moves |= bool(moving.any())
         write_mask(folder / f"{name}.png", moving.numpy())
     return any_moves
+
+
+def _numbered(by_name: Mapping[str, Path]) -> dict[int, Path]:
+    """Return masks by the last number in their names, where most have one form but for that."""
+    last = re.compile(r"(\d+)(?=\D*$)")
+    forms = {name: last.sub("0", name) for name in by_name if last.search(name)}
+    most = Counter(forms.values()).most_common(1)
+    return {int(last.search(name)[1]): by_name[name] for name, form in forms.items() if form == most[0][0]}
 
 
 def write_mask(path: Path, is_dark: np.ndarray) -> None:

@@ -64,13 +64,14 @@ Offsets = str | float | Sequence[float] | Mapping[str, float] | None  # see ``of
 @dataclass(frozen=True)
 class Recording:
     """What one camera of a rig took: a video at ``path``, or the ``images`` of a folder; ``stamps`` are their
-    seconds on its own clock.
+    seconds on its own clock; ``told`` are lines on what was left out.
     """
 
     name: str
     path: Path
     stamps: np.ndarray
     images: tuple[Path, ...] = ()
+    told: Sequence[str] = ()
 
     @property
     def gap(self) -> float:
@@ -135,7 +136,7 @@ def cameras_in(folder: Path) -> dict[str, Path]:
         )
     if not found:
         places = ((path, place) for path in inner for place in (path, path / "images"))
-        found = {path.name: place for path, place in places if place.is_dir() and images_in(place)}
+        found = {path.name: place for path, place in places if place.is_dir() and images_in(place)[0]}
     if len(found) < 2:
         got = f"one, {next(iter(found))}; for one camera set video=" if found else "none"
         raise mismatch("videos", f"at least two videos, or sub-folders of pictures, in {folder}", got)
@@ -165,9 +166,9 @@ def recordings(
 
 
 def _recording(name: str, path: Path, rate: float | None, name_pattern: str | None) -> Recording:
-    images = ()
+    images, told = (), []
     if path.is_dir():
-        images = tuple(images_in(path))
+        images, told = images_in(path)
         read = read_names([image.stem for image in images], str(path), name_pattern, one_camera=True)
         numbers = range(len(images)) if read is None else read.frames
         stamps = np.array(numbers, dtype=np.float64) / (rate or 1.0)
@@ -181,7 +182,7 @@ def _recording(name: str, path: Path, rate: float | None, name_pattern: str | No
         raise mismatch(path, f"many {kind}", got, f"leave it out ({_without(name)})")
     if not np.all(np.diff(stamps) > 0):
         raise mismatch(path, "frames at different times", "two at one", "convert the video")
-    return Recording(name, path, stamps, images)
+    return Recording(name, path, stamps, images, told)
 
 
 def _without(*names: str) -> str:
@@ -402,6 +403,7 @@ def capture_rig(
     if isinstance(offsets, Mapping):
         offsets = {str(name): seconds for name, seconds in offsets.items()}
     everyone, films = list(cameras_in(folder)), recordings(folder, rate, without, name_pattern)
+    left = [line for film in films for line in film.told]
     about = {"videos": folder, "masks": masks, "fixed": fixed, "rate": rate, "frames": frames, "size": size}
     about |= {"name_pattern": name_pattern} if name_pattern is not None else {}
     with work_for(out, search, (folder, masks), **about, offsets=offsets) as folder_of_work:
@@ -444,7 +446,7 @@ def capture_rig(
                 "span": span,
                 "without": sorted({*everyone} - {*cameras}),
                 "lost": lost,
-                "told": [*filter(None, [missing, unmasked]), *_suspects(cameras)],
+                "told": [*filter(None, [missing, unmasked]), *left, *_suspects(cameras)],
                 "why": why,
                 "moments": len({*images.moments.values()}),
                 "pictures": len(images.times),

@@ -63,6 +63,12 @@ SIDE = re.compile(
     r"(?i)(?:^|[^a-z])(?:dynamic_?|motion_?|resized_?)?(mask|depth|disparity|disp|matte|segm?|segmentation)"
     r"(?:s|_?maps?)?(?![a-z])"
 )
+# Words of names of files that go with an image, and words that may stand in their place in the image's name.
+_BESIDE = re.compile(
+    r"(?i)(?<![a-z])(?:dynamic_?|motion_?)?(mask|depth|disparity|disp|matte|segm?|segmentation|alpha|normal"
+    r"|flow|thumb(?:nail)?)(?:s|_?maps?)?(?![a-z])"
+)
+_PICTURE = re.compile(r"(?i)(?<![a-z])(?:colou?r|rgb|image|img|frame|picture|pic)s?(?![a-z])")
 RECORD = "synthesis.json"  # of every synthesised scene, or folder of them
 LOCK = ".lock"  # of every folder of a run
 _UNPRINTABLE = {"Cc", "Cs", "Zl", "Zp"}  # control characters, surrogates, line and paragraph separators
@@ -333,6 +339,54 @@ def side_files(folders: Iterable[Path], read: Iterable[Path], advice: str) -> li
             )
             lines += [f"{folder}: {some} not read, which seem to be masks or depth"] if files else []
     return [f"{line}; {advice}" for line in lines]
+
+
+def beside_images(paths: Iterable[Path], folder: Path) -> tuple[list[Path], dict[Path, Path]]:
+    """Split files into images, and masks, depth and others that go with one, as ``1_mask.png`` with ``1.png``
+    or ``1_rgb.png``; a file without such an image is one itself. Order stays.
+
+    Args:
+        paths: of images, and what is beside them; or of films.
+        folder: that they are in; names of its sub-folders count, too.
+
+    Returns:
+        the images; and the image of each other file.
+    """
+    names = {path: composed(path.relative_to(folder).with_suffix("").as_posix()) for path in paths}
+
+    def key(name: str) -> str:
+        return re.sub(r"[\W_]+", " ", _PICTURE.sub("", _BESIDE.sub("", name))).strip()
+
+    images = {key(name): path for path, name in names.items() if not _BESIDE.search(name)}
+    sides = ((path, key(name)) for path, name in names.items() if _BESIDE.search(name))
+    others = {path: images[bare] for path, bare in sides if bare in images}
+    return [path for path in names if path not in others], others
+
+
+def images_alone(paths: Iterable[Path], folder: Path) -> tuple[list[Path], list[str]]:
+    """Leave out what goes with images, see ``beside_images``, and say so in a line.
+
+    Raises:
+        SceneError: for two images of one name, as PNG and JPEG.
+    """
+    images, others = beside_images(paths, folder)
+    first: dict[str, Path] = {}
+    for path in images:
+        other = first.setdefault(composed(path.relative_to(folder).with_suffix("").as_posix()), path)
+        if other is not path:
+            advice = "remove one of them, of each image"
+            raise mismatch(folder, "one image of each name", f"{other.name} and {path.name}", advice)
+    return images, left_out(others, folder)
+
+
+def left_out(others: Mapping[Path, Path], folder: Path) -> list[str]:
+    """Say in a line which files of ``folder`` are no images, but go with one: see ``beside_images``."""
+    if not others:
+        return []
+    path, image = next(iter(others.items()))
+    more = f" and {len(others) - 1} more are" if len(others) > 1 else " is"
+    name, beside = path.relative_to(folder), image.relative_to(folder)
+    return [f"{folder}: {name}{more} left out, as what goes with {beside}"]
 
 
 def stated(content: Mapping) -> dict:

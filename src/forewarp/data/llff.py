@@ -7,7 +7,7 @@ from pathlib import Path
 
 from forewarp.data.agreement import small_image
 from forewarp.data.cameras import opengl_rows
-from forewarp.data.files import SUFFIXES, mismatch
+from forewarp.data.files import SUFFIXES, images_alone, mismatch
 from forewarp.data.images import by, inspect_image, read_image
 from forewarp.data.multicam import FILE, ordered_rows
 from forewarp.data.names import in_order
@@ -24,7 +24,7 @@ def as_transforms(folder: Path) -> tuple[dict, list[str]]:
         SceneError: for other numbers of rows and images, for rows that are none, and images of another shape.
     """
     there = (path for path in (folder / "images").glob("[!.]*") if path.suffix in SUFFIXES)
-    paths = in_order(there, lambda path: path.name)
+    paths, told = images_alone(in_order(there, lambda path: path.name), folder / "images")
     if not paths:
         raise mismatch(folder / "images", "an image for each row of poses_bounds.npy", "none")
     advice = "rename images with as many digits each"
@@ -42,4 +42,4 @@ def as_transforms(folder: Path) -> tuple[dict, list[str]]:
         frames.append({"file_path": f"images/{path.name}", "transform_matrix": pose, "fl_x": focal})
     aslant = max(math.hypot(1, math.hypot(c.width / c.fx, c.height / c.fy) / 2) for c in cameras)
     ends = {"near": min(c.near for c in cameras), "far": aslant * max(c.far for c in cameras)}
-    return {"frames": frames, **ends}, assumed
+    return {"frames": frames, **ends}, told + assumed

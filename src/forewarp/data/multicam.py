@@ -29,7 +29,10 @@ from forewarp.data.directions import inverted, refuse_other_readings
 from forewarp.data.files import SIDE as SIDE_FILES
 from forewarp.data.files import (
     SUFFIXES,
+    beside_images,
+    images_alone,
     layout_of,
+    left_out,
     mismatch,
     number,
     one_of,
@@ -72,7 +75,7 @@ class _Track:
     """What a camera took: a video at ``path``, or ``images`` in a folder, ``size`` (width, height) on disk.
 
     ``stamps`` are the seconds of a video's frames, None of a folder; ``turned`` the images that their EXIF
-    orientation turns; ``numbers`` are those in their names, ascending.
+    orientation turns; ``numbers`` are those in their names, ascending; ``told`` says what was left out.
     """
 
     path: Path
@@ -81,6 +84,7 @@ class _Track:
     images: tuple[Path, ...] = ()
     turned: frozenset[Path] = frozenset()
     numbers: np.ndarray | None = None
+    told: Sequence[str] = ()
 
     def __len__(self) -> int:
         return len(self.images) if self.stamps is None else len(self.stamps)
@@ -131,7 +135,7 @@ def read_scene(
     folder = scene_folder(root, scene, "DyNeRF")
     one_of(normalise, "data.normalise", True, False)
     scale, every = whole(scale, "data.scale", 1), whole(test_every, "data.test_every", 1)
-    paths, others = _paths(folder)
+    paths, others, told = _paths(folder)
     one_of(camera_order, "data.camera_order", "number", "text", None)
     tracks = [_look(path, name_pattern) for path in paths.values()]
     images = lambda: [small_image(_first_image(track)) for track in tracks]  # noqa: E731
@@ -148,7 +152,8 @@ def read_scene(
         ordered.append(f"{folder}: {some} not read, as names of cameras begin with cam")
     count, assumed = _moments(tracks, None if frames is None else whole(frames, "data.frames", 1), folder)
     turned = [path for track in tracks for path in track.images[:count] if path in track.turned]
-    assumed += ordered + exif_turned(turned, folder)
+    told += [line for track in tracks for line in track.told][:1]  # all cameras are alike
+    assumed += told + ordered + exif_turned(turned, folder)
     assumed += side_files([folder], [], "this layout has none: use experiment=video_with_poses for them")
     default = [0] if len(paths) > 1 else []  # one camera may be tested on moments
     held, moments = held_cameras(test_cameras, list(paths), default), held_moments(test_moments, count)
@@ -230,14 +235,26 @@ def write_poses(folder: str | Path, cameras: Sequence[Camera], *, near: float, f
         np.save(beside, np.array(rows))
 
 
-def _paths(folder: Path) -> tuple[dict[str, Path], list[str]]:
-    """Find the video or the folder of frames of each camera, by name, in the order of numbers, and names of
-    other videos and folders of images.
+def _paths(folder: Path) -> tuple[dict[str, Path], list[str], list[str]]:
+    """Find the video or the folder of frames of each camera, by name, in the order of numbers; names of other
+    videos and folders of images; and say in lines what was left out.
     """
-    found = {path.stem: path for path in folder.glob("cam*") if path.suffix.lower() in VIDEOS}
-    for path in folder.glob("cam*/"):
-        inner = next((place for place in (path, path / "images") if _images(place)), None)
-        found |= {} if inner is None else {path.name: inner}
+    films = [path for path in folder.glob("cam*") if path.suffix.lower() in VIDEOS]
+    films.sort(key=lambda path: (VIDEOS.index(path.suffix.lower()), path.name))
+    inner = [(path, place) for path in folder.glob("cam*/") for place in (path / "images", path)]
+    folders = {path: place for path, place in inner if _images(place)}
+    cameras, sides = beside_images([*folders, *films], folder)
+    unsaid = {path: image for path, image in sides.items() if not SIDE_FILES.search(path.name)}
+    told = left_out(unsaid, folder)  # of masks and depth ``side_files`` speaks
+    found, twice = {}, []
+    for path in cameras:
+        taken = found.setdefault(path.name if path in folders else path.stem, path)
+        twice += [(taken, path)] if taken is not path else []
+    if twice:
+        (taken, other), more = twice[0], f", and so of {len(twice) - 1} more" if twice[1:] else ""
+        name = f"{taken.name}{'/' if taken in folders else ''}"
+        told.append(f"{folder}: {name} is read, not {other.name}{more}; remove what is old")
+    found = {name: folders.get(path, path) for name, path in found.items()}
     there = [path for path in folder.glob("[!.]*") if path.suffix.lower() in VIDEOS]
     deep = [path for path in folder.glob("[!.]*/") if _images(path) or _images(path / "images")]
     if not found:
@@ -252,8 +269,8 @@ def _paths(folder: Path) -> tuple[dict[str, Path], list[str]]:
             advice = f"rename them to cam00{kind}, cam01{kind} .. in the order of the rows of {FILE}"
         raise mismatch(folder, expected, got, advice)
     others = {path.name for path in (*there, *deep) if path.stem not in found and path.name not in found}
-    others = in_order(name for name in others if not SIDE_FILES.search(name))
-    return {name: found[name] for name in in_order(found)}, others
+    others = in_order(name for name in others - {path.name for path in sides} if not SIDE_FILES.search(name))
+    return {name: found[name] for name in in_order(found)}, others, told
 
 
 def _images(folder: Path) -> list[Path]:
@@ -338,7 +355,8 @@ def _first_image(track: _Track) -> Tensor:
 def _look(path: Path, name_pattern: str | None) -> _Track:
     """Find the size and number of a camera's frames."""
     if path.is_dir():
-        images, turned, size = _images(path), set(), None
+        images, told = images_alone(_images(path), path)
+        turned, size = set(), None
         read = read_names([image.stem for image in images], str(path), name_pattern, one_camera=True)
         numbers = np.arange(len(images)) if read is None else np.array(read.frames)
         order = np.argsort(numbers, kind="stable")
@@ -348,7 +366,7 @@ def _look(path: Path, name_pattern: str | None) -> _Track:
             size = header.size
             turned |= {image} if header.is_turned else set()
         place = path.parent if path.name == "images" else path
-        return _Track(place, size, None, images, frozenset(turned), numbers)
+        return _Track(place, size, None, images, frozenset(turned), numbers, told)
     stamps = stamps_of(path)
     first = next(extracted(path, [0], None), None) if len(stamps) else None
     if first is None:
