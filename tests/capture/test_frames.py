@@ -11,7 +11,17 @@ from scipy.ndimage import gaussian_filter
 
 pytest.importorskip("pycolmap", reason="no pycolmap; make install adds it")
 
-from forewarp.capture.frames import Source, bars_of, edge_width, extracted, measure, sharpest, sharpness, take
+from forewarp.capture.frames import (
+    Source,
+    bars_of,
+    edge_width,
+    extracted,
+    measure,
+    sharpest,
+    sharpness,
+    take,
+    write_smaller,
+)
 from forewarp.capture.poses import BLURRED
 from tests.support.captures import quiet, step
 from tests.support.films import numbered, write_film, write_planes
@@ -560,3 +570,11 @@ def test_what_other_programs_leave_names_the_way(tmp_path, file, said):
     (tmp_path / file).touch()
     with pytest.raises(ValueError, match=said):
         taken(tmp_path, tmp_path / "p")
+
+
+def test_smaller_images_show_the_whole_one_as_readers_scale_its_camera(tmp_path):
+    ramp = np.arange(103, dtype=np.uint8)[None, :, None].repeat(77, 0).repeat(3, 2)
+    write_smaller(tmp_path, "a.png", ramp, 8)
+    small = np.array(Image.open(tmp_path / "images_8" / "a.png"))
+    assert small.shape == (9, 12, 3)
+    assert small[4, :, 0] == pytest.approx((np.arange(12) + 0.5) * 103 / 12 - 0.5, abs=1)

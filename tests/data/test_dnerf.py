@@ -73,14 +73,15 @@ def test_half_resolution_of_a_small_scene(tmp_path, value, expected):
     assert scene.protocol["half_resolution"] is (value is True)
 
 
-def test_a_mask_path_cuts_an_image_out(tmp_path):
+@pytest.mark.parametrize("at_top", [False, True])
+def test_a_mask_path_cuts_an_image_out(tmp_path, at_top):
     mask = np.zeros((6, 8), np.uint8)
     mask[2:4, 3:6] = 255
     write_dnerf(tmp_path / "toy")
     write_image(tmp_path / "toy" / "m.jpg", mask)
     for split in ("train", "val", "test"):
         path = tmp_path / "toy" / f"transforms_{split}.json"
-        edit(path, lambda c: [frame.update(mask_path="m.jpg") for frame in c["frames"]])
+        edit(path, lambda c: [d.update(mask_path="m.jpg") for d in ([c] if at_top else c["frames"])])
     scene, bare = read_scene(tmp_path, "toy"), next(dnerf_shots(4)).rgba
     assert scene.has_alpha
     assert np.array_equal(scene.train[0].load()[..., 3], bare[..., 3] * (mask > 0))

@@ -180,6 +180,20 @@ def test_every_label_of_a_grey_mask_is_foreground(tmp_path, levels):
     assert torch.equal(bright(tmp_path / "mask.png"), torch.from_numpy(pixels > 0))
 
 
+@pytest.mark.parametrize("beneath", ["image", "erased"])
+def test_the_alpha_of_an_image_that_was_cut_out_is_the_mask(tmp_path, beneath):
+    rgba = np.random.default_rng(0).integers(0, 256, (40, 60, 4), np.uint8)
+    mask = np.zeros((40, 60), bool)
+    mask[8:30, 10:40] = True
+    rgba[..., 3] = 255 * mask
+    rgba *= np.uint8(mask[..., None] | (beneath == "image"))
+    write_image(tmp_path / "mask.png", rgba)
+    assert torch.equal(bright(tmp_path / "mask.png"), torch.from_numpy(mask))
+    rgba[..., :3] = 255 * (rgba[..., :1] > 60)  # a mask in the colours, of other shape
+    write_image(tmp_path / "mask.png", rgba)
+    assert torch.equal(bright(tmp_path / "mask.png"), torch.from_numpy(rgba[..., 0] > 0))
+
+
 @pytest.mark.parametrize("kind", ["half", "bilinear", "JPEG"])
 def test_soft_edges_are_no_labels(tmp_path, kind):
     row, column = np.mgrid[:64, :96]

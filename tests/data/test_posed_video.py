@@ -400,6 +400,15 @@ def masked(tmp_path, made):
     return mask
 
 
+def test_masks_at_the_top_are_of_all_frames(tmp_path, masked):
+    mask = torch.from_numpy(masked())
+    edit(tmp_path / "toy" / FILE, lambda c: [frame.pop("mask_path") for frame in c["frames"]])
+    edit(tmp_path / "toy" / FILE, {"mask_path": "masks/m_0.png", "moving_path": "masks/m_1.png"})
+    for frame in read_scene(tmp_path, "toy").train:
+        assert torch.equal(frame.load_valid(), mask)
+        assert torch.equal(frame.load_moving(), mask)
+
+
 @pytest.mark.parametrize("brightness", [255, 1, 38])
 def test_masks_of_nerfstudio_tell_where_to_train_and_measure(tmp_path, masked, brightness):
     mask = torch.from_numpy(masked(brightness))

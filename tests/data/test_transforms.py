@@ -34,6 +34,12 @@ def camera(stored=(80, 60), common=None, **own):
         ({"camera_angle_x": WIDE, "fl_x": 80.5}, 80.5, 80.5, 40),
         ({"fl_x": 90, "fl_y": 70, "cx": 50}, 90, 70, 50),
         ({"fl_x": 90, "common": {"camera_angle_x": WIDE}}, 90, 90, 40),  # a frame's own number wins
+        ({"camera_angle_x": WIDE, "common": {"fl_x": 90}}, 80, 80, 40),
+        ({"camera_angle_x": WIDE, "common": {"fl_y": 90}}, 80, 80, 40),
+        ({"camera_angle_x": WIDE, "common": {"fl_x": 90, "fl_y": 45}}, 80, 40, 40),  # pixels keep their shape
+        ({"camera_angle_x": WIDE, "common": {"fl_x": 80.1}}, 80.1, 80.1, 40),  # the same, rounded
+        ({"fl_x": 90, "common": {"fl_x": 60, "fl_y": 60}}, 90, 90, 40),
+        ({"fl_x": 90, "common": {"fl_y": 70}}, 90, 70, 40),
         ({"camera_angle_y": 2 * math.atan(0.375)}, 80, 80, 40),  # of the height, where it stands alone
     ],
 )
@@ -52,6 +58,7 @@ FOUR = [[80.0, 0, 40, 0], [0, 81, 20, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
     [
         ({"cam_K": MATRIX}, {"camera_angle_x": WIDE}, 80, ""),
         ({"K": FOUR}, {"fl_x": 90.0, "cx": 7.0}, 80, ""),
+        ({"camera_angle_x": 2 * math.atan(0.25)}, {"K": MATRIX}, 160, ""),
         ({"camera_matrix": [80, 0, 40, 0, 81, 20, 0, 0, 1]}, {}, 80, ""),
         ({}, {"intrinsics": MATRIX}, 80, ""),
         ({"fl_x": 80.0, "K": MATRIX}, {}, 80, ""),
@@ -500,6 +507,7 @@ def test_poses_written_in_another_way_are_refused_with_the_mend(matrix, said):
         ),
         ({"white_transparent": True}, "white_transparent: not read: images show their background; cut the"),
         ({"white_transparent": False, "cameras": [{"id": 0, "place": [0, 0, 0]}]}, None),
+        ({"depth_file_path": "a.npy"}, "depth_file_path at the top is not read; write that of each frame"),
     ],
 )
 def test_keys_of_cameras_and_of_backgrounds_that_are_not_read_are_named(tmp_path, keys, said):

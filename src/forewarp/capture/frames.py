@@ -360,11 +360,8 @@ def within(pixels: np.ndarray, size: int | None) -> np.ndarray:
 
 
 def write_smaller(folder: Path, name: str, pixels: np.ndarray, scale: int) -> None:
-    """Write an image ``scale`` times smaller into ``images_<scale>``: the mean of each block of pixels, less
-    what is left at the ends.
-    """
-    height, width = (n // scale for n in pixels.shape[:2])
-    small = shrunk(pixels[: height * scale, : width * scale], height, width)
+    """Write a whole image ``scale`` times smaller, its sides rounded down, into ``images_<scale>``."""
+    small = shrunk(pixels, *(n // scale for n in pixels.shape[:2]))
     write_image(folder / f"images_{scale}" / name, small)
 
 

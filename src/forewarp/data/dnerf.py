@@ -336,7 +336,7 @@ def _read_file(path: Path, ability: str, **options) -> tuple[list[_Record], list
             depth = file, None if scale is None else entry.number("depth_scale", 1e-12, 1e6)
         own = entry.own.get("ability", ability)
         one_of(own, entry.where("ability"), *ABILITIES, "all")
-        if "mask_path" in entry.own:
+        if entry.get("mask_path") is not None:
             mask = image_of(entry, "mask_path")
             inspect_image(mask, image.header.size, f" as {image.path.name}")
         records.append(_Record(**vars(image), mask=mask, depth=depth, ability=own))

@@ -40,6 +40,7 @@ _OTHER_KINDS = {  # at which byte, which marks tell them
 _ORIENTATION = 0x0112  # EXIF's tag
 _JPEG_END, _JPEG_TAIL = b"\xff\xd9", 4096  # some cameras write a little behind the end
 _LEAST_HIDDEN, _COLORS = 0.01, 64  # share of an image, and colours, that tell an image beneath
+_LOOKED_AT = 1 << 18  # pixels, so as not to sort those of large images
 _ROUNDED, _STRAY, _LEAST_EDGES, _EDGES_OF = 2, 0.001, 50, 4  # of an edge; share, least edges, images
 _FOREGROUND = 127  # a mask above it is foreground; masks are lossy, so never quite 0 or 255
 _COLORED = 32  # of 255: difference of channels of a mask with colours; all of a DAVIS palette are as bright
@@ -117,8 +118,8 @@ CACHE = ImageCache(1_000_000_000)
 
 @dataclass(frozen=True)
 class Header:
-    """What an image says of itself: ``size`` is (width, height) in pixels; ``is_turned`` tells whether a JPEG
-    is to be turned before it is shown.
+    """What an image says of itself: ``size`` is (width, height) in pixels; ``is_turned`` tells whether it is
+    to be turned before it is shown.
     """
 
     size: tuple[int, int]
@@ -408,8 +409,8 @@ class MovingMask(StoredMask):
 def bright(path: Path, size: tuple[int, int] | None = None, of_alpha: bool = False) -> Tensor:
     """Decode what is foreground in a mask, (H, W) bool: where it is above 127; in one with colours, as a
     palette has them for several objects, whatever is not black; in one of small numbers, and in a PNG of few
-    levels that fill areas beside 0, as labels do and soft edges don't, whatever is not 0. Of a mask of one
-    colour whose alpha varies the alpha counts.
+    levels that fill areas beside 0, as labels do and soft edges don't, whatever is not 0. Where alpha varies
+    it counts, if colours are one, or those of an image that was cut out.
 
     Args:
         path: of the mask.
@@ -421,7 +422,8 @@ def bright(path: Path, size: tuple[int, int] | None = None, of_alpha: bool = Fal
     """
     rgba = read_image(path, size)
     if not of_alpha and bool((rgba[..., 3] != rgba[0, 0, 3]).any()):
-        of_alpha = bool((rgba[..., :3] == rgba[0, 0, :3]).all())
+        inside = rgba[rgba[..., 3] > _FOREGROUND][:, :3]
+        of_alpha = bool((rgba[..., :3] == rgba[0, 0, :3]).all()) or _are_of_image(inside)
     values = rgba[..., 3] if of_alpha else rgba[..., :3].amax(-1)
     is_colored = not of_alpha and int((values - rgba[..., :3].amin(-1)).max()) >= _COLORED
     is_labels = not of_alpha and path.suffix.lower() == ".png" and _are_labels(values)
@@ -453,10 +455,14 @@ def hides_image(rgba: Tensor) -> bool:
     ("no depth here", as of dycheck) or the image was given a mask and nothing was erased.
     """
     beneath = rgba[rgba[..., 3] == 0][:, :3]
-    if len(beneath) < max(_LEAST_HIDDEN * rgba[..., 3].numel(), _COLORS):
-        return False
-    colors, counts = beneath.unique(dim=0, return_counts=True)
-    return len(colors) >= _COLORS and int(counts.max()) < len(beneath) / 2
+    return len(beneath) >= max(_LEAST_HIDDEN * rgba[..., 3].numel(), _COLORS) and _are_of_image(beneath)
+
+
+def _are_of_image(colors: Tensor) -> bool:
+    """Tell whether colours (N, 3) are many, none of them that of most."""
+    colors = colors[:: 1 + len(colors) // _LOOKED_AT].int() @ torch.tensor([65536, 256, 1], dtype=torch.int32)
+    counts = colors.unique(return_counts=True)[1]
+    return len(counts) >= _COLORS and int(counts.max()) < len(colors) / 2
 
 
 def _decode(path: Path, mode: str, upright: bool = False) -> np.ndarray:
@@ -490,8 +496,8 @@ def _inspect(stream: BinaryIO, path: Path, mode: str = "RGBA") -> Header:
         got = "16 bits" if has_16_bits else "CMYK"
         raise mismatch(path, "8 bits a channel, grey or RGB", got, "convert the image")
     is_turned = False
-    with suppress(Exception):  # a harmed tag, of what no pixel depends on; of a PNG asking would decode it
-        is_turned = image.format in ("JPEG", "MPO") and image.getexif().get(_ORIENTATION, 1) not in (0, 1)
+    with suppress(Exception):  # a harmed tag, of what no pixel depends on; a PNG's own method would decode it
+        is_turned = Image.Image.getexif(image).get(_ORIENTATION, 1) not in (0, 1)
     header, is_whole = Header(image.size, image.has_transparency_data, is_turned), False
     with suppress(Exception):  # OSError, SyntaxError and more
         is_whole = image.verify() is None if image.format == "PNG" else _has_jpeg_end(stream)

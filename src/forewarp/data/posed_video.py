@@ -347,7 +347,7 @@ def _read_entries(
     entries, has_mask, dark = [], [], []
     for image in images:
         mask, valid, entry, has_alpha = None, None, image.entry, image.header.has_alpha
-        if "mask_path" in entry.own and masks != "off":
+        if entry.get("mask_path") is not None and masks != "off":
             mask = image_of(entry, "mask_path", scale)
             inspect_image(mask, image.header.size, f" as {image.path.name}")
         if masks == "ignore" and mask is None and not has_alpha:
@@ -411,7 +411,7 @@ def _motion(image: ListedImage, key: str, scale: int) -> MovingMask | None:
     Raises:
         SceneError: for a mask that is not as large as the image that is not ``scale`` times smaller.
     """
-    if key not in image.entry.own:
+    if image.entry.get(key) is None:
         return None
     mask, size = MovingMask(image_of(image.entry, key), image.header.size), image.header.size
     found = inspect_image(mask.path).size

@@ -67,6 +67,7 @@ _HAS_FOCAL = re.compile(
 _CUT_OUT = re.compile("(?i)(white|black)_?(is_?)?(transparent|bkgd|background)")  # of images without alpha
 _FOCAL = ("fl_x", "fl_y", "camera_angle_x")
 _SAME_FOCAL = 0.02  # share by which two focal lengths of one camera may differ
+_SAME_ZOOM = 0.002  # share by which a frame's own angle may differ, rounded, from a focal length of all
 _RESIZED = 0.1  # by which more or less than half of both sides it is another image's, unless w and h say not
 _OUTSIDE = 0.9  # share of a side beyond which a principal point is another image's
 _TIMES = ("timestamp", "time_stamp", "frame_time", "time_id", "t", "frame_id", "frame")  # of programs
@@ -163,7 +164,7 @@ def unread_beside(
         beside: folders that are read as well.
     """
     entries = frames_of(file, content)
-    named = [entry.own.get(key) for entry in entries for key in _PATHS]
+    named = [entry.get(key) for entry in entries for key in _PATHS]
     read = [*images, *beside, file.parent / "confidence"]
     read += [file.parent / os.path.normpath(path) for path in named if isinstance(path, str)]
     folders = [file.parent, *(image.parent for image in images)]
@@ -189,6 +190,8 @@ def unread_beside(
     if cut:
         advice = "cut the subject out by alpha, or name masks by mask_path and set data.masks=alpha"
         lines.append(f"{file}: {cut[0]}: not read: images show their background; {advice}")
+    if "depth_file_path" in entries[0].common:
+        lines.append(f"{file}: depth_file_path at the top is not read; write that of each frame into it")
     if not like:
         return lines
     advice = "masks are read from mask_path, depth from depth_file_path, a lens from k1 k2 k3 p1 p2 and cx cy"
@@ -255,6 +258,9 @@ def camera_of(
     width, height = map(round, sizes)
     fx = _focal(entry, width, height, longer)
     fy = entry.number("fl_y", 0.01 * height, 100 * height, fx)
+    if "fl_y" in entry.common and "fl_y" not in entry.own:  # of a zoom all keep the shape of their pixels
+        of_all = entry.common.get("fl_x", None if "fl_x" in entry.own else fy)
+        fy *= fx / of_all if is_number(of_all) and of_all > 0 else 1
     cx, cy = (entry.number(key, -n, 2 * n, n / 2) for key, n in (("cx", width), ("cy", height)))
     if entry.get("w") is None and (cx >= _OUTSIDE * width or cy >= _OUTSIDE * height):
         got = f"({cx:g}, {cy:g}) of images of {by(stored)} pixels"
@@ -301,7 +307,7 @@ def check_pinhole(entry: Entry) -> None:
 
 def _focal(entry: Entry, width: int, height: int, longer: bool) -> float:
     """Return the horizontal focal length in pixels, from ``fl_x``, ``fl_y``, ``camera_angle_x`` or, where it
-    stands alone, ``camera_angle_y``.
+    stands alone, ``camera_angle_y``; a frame's own number wins over one at the top.
     """
     least, most = 0.01 * width, 100 * width
     named = next((key for key in ("fl_x", "fl_y") if entry.get(key) is not None), None)
@@ -319,15 +325,18 @@ def _focal(entry: Entry, width: int, height: int, longer: bool) -> float:
     half = None if angle is None else 2 * math.tan(0.5 * angle)
     if across == "camera_angle_y":
         return height / half
+    across_pixels = (max(width, height) if longer else width) / half if half else None
     if named is None:
-        return (max(width, height) if longer else width) / half
+        return across_pixels
     if is_number(focal := entry.get(named)) and 0 < focal < least:
         expected = f"a focal length in pixels, of {least:g} to {most:g}"
         raise mismatch(entry.where(named), expected, focal, IN_PIXELS.replace("fl_x", named))
     focal = entry.number(named, least, most)
-    same_place = ("camera_angle_x" in entry.own) == (named in entry.own)
-    agrees = half is None or any(abs(side / half / focal - 1) < _SAME_FOCAL for side in (width, height))
-    if same_place and not agrees:  # else a frame's own number stands for that of all
+    offs = [0 if half is None else abs(side / half / focal - 1) for side in (width, height)]
+    is_own = [any(key in entry.own for key in keys) for keys in (("camera_angle_x",), ("fl_x", "fl_y"))]
+    if is_own == [True, False] and min(offs if height > width else offs[:1]) > _SAME_ZOOM:
+        return across_pixels
+    if ("camera_angle_x" in entry.own) == (named in entry.own) and min(offs) >= _SAME_FOCAL:
         told = 2 * math.atan(0.5 * width / focal)
         expected = f"{told:.4g} radians ({math.degrees(told):.1f} degrees), as {named} says"
         got = f"{angle:.4g} ({math.degrees(angle):.1f} degrees)"
