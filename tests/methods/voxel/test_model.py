@@ -157,8 +157,9 @@ def test_learned_nodes_begin_with_the_motion_of_another_method():
         carried(Turning(), Handover(tiny.BOX, True, 6), f2, carry="motion")
 
 
+@pytest.mark.parametrize("carry", ["all", "motion"])
 @pytest.mark.parametrize("nodes", [0, 8])
-def test_deformation_features_lie_at_nodes_or_voxels_and_are_carried_to_others(nodes):
+def test_deformation_features_lie_at_nodes_or_voxels_and_are_carried_to_others(nodes, carry):
     model = tiny.forward_model(trajectory=partial(TrajectoryField, bases=3, nodes=nodes, features=2))
     before = fresh(model)
     torch.nn.init.normal_(before.motion.trajectory.network[-1].weight)
@@ -169,7 +170,7 @@ def test_deformation_features_lie_at_nodes_or_voxels_and_are_carried_to_others(n
     features.grid.data = features.lattice.to_world(features.voxels) @ torch.rand(3, 2)  # linear in the place
     times = torch.tensor([0.4, 1.0])
     expected = before.trajectories(points, times).detach()
-    after = carried(before, left(before), model, num_voxels=[[0, 3000]])
+    after = carried(before, left(before), model, num_voxels=[[0, 3000]], carry=carry)
     lattice = after.motion.trajectory.features.lattice
     assert lattice == (after.motion.trajectory.lattice if nodes else after.radiance.lattice)
     torch.testing.assert_close(after.trajectories(points, times), expected)
