@@ -261,6 +261,20 @@ def ball(premultiplied, brightness=200, size=64):
     return np.rint(np.concatenate([rgb, 255 * alpha], -1)).astype(np.uint8)
 
 
+@pytest.mark.parametrize("in_training", [False, True])
+def test_splits_may_differ_in_how_colours_are_multiplied(tmp_path, in_training):
+    parts = {"train": in_training, "test": not in_training}
+    written = {s: [replace(shot, rgba=ball(is_so)) for shot in dnerf_shots(4)] for s, is_so in parts.items()}
+    written["val"] = dnerf_shots(1, size=(64, 64))
+    dnerf.write_scene(tmp_path / "toy", written, camera_angle_x=0.7)
+    scene = dnerf.read_scene(tmp_path, "toy")
+    (line,) = [line for line in scene.protocol["assumed"] if "multiplied" in line]
+    assert f"colours of {'train' if in_training else 'test'} images, unlike those of the others, are" in line
+    for part in (scene.train, scene.test):
+        off = part[0].load().int() - torch.from_numpy(ball(False)).int()
+        assert int(off.abs().max()) <= 200 // 20  # of thin alpha little is left
+
+
 @pytest.mark.parametrize("read", ["dnerf", "video"])
 def test_premultiplied_colours_are_recognised_by_edges(read, tmp_path):
     shots = [replace(shot, rgba=ball(True)) for shot in dnerf_shots(4)]

@@ -205,6 +205,45 @@ def test_both_spellings_of_the_tangential_distortion(tmp_path):
     assert read_camera(path, 1, 2).lens.p == (0, 0)
 
 
+@pytest.mark.parametrize(
+    ("keys", "said"),
+    [
+        ({"radial_distortion": GONE, "radial": [0.1, 0, 0]}, "radial"),
+        ({"distortion": [0.1, 0.2]}, "distortion"),
+        ({"k1": 0.1, "k2": 0}, "k1"),
+        ({"focal_length_y": 99.0}, "focal_length_y"),
+        ({"tangential": [0.0, 0.0], "tangential_distortion": [0.01, 0.0]}, "tangential_distortion"),
+        ({"k1": 0.0, "distortion": None, "exposure": 3}, None),
+    ],
+)
+def test_keys_of_lenses_that_are_not_read_are_named(tmp_path, keys, said):
+    folder = write_rig(tmp_path / "toy", rig())
+    for file in (folder / "camera").glob("*.json"):
+        edit(file, keys | {"fy": json.loads(file.read_text())["focal_length"]})  # the same twice
+    lines = [
+        line for line in read_scene(tmp_path, "toy").protocol.get("assumed", []) if "of the lens" in line
+    ]
+    assert [line.split(": ")[1] for line in lines] == ([said] if said else [])
+
+
+def test_ids_in_another_order_are_split_in_that_of_time(tmp_path):
+    folder = write_rig(tmp_path / "toy", hand(13))
+    before = read_scene(tmp_path, "toy")
+    edit(folder / "dataset.json", lambda c: c["ids"].sort(key=lambda name: str(int(name))))
+    after = read_scene(tmp_path, "toy")
+    names = [[f.name for f in part] for part in (before.train, before.test)]
+    assert [[f.name for f in part] for part in (after.train, after.test)] == names
+    assert "dataset.json: ids are not in the order of time" in after.protocol["assumed"][0]
+
+
+def test_which_of_two_images_of_one_id_is_read_is_said(tmp_path):
+    folder = write_rig(tmp_path / "toy", rig())
+    path = next((folder / "rgb/2x").glob("*.png"))
+    write_image(path.with_suffix(".jpg"), np.zeros((2, 2, 3), np.uint8))
+    (line,) = read_scene(tmp_path, "toy").protocol["assumed"]
+    assert f"{path.name} is read, not {path.stem}.jpg beside it; remove those that are not meant" in line
+
+
 def test_a_genuine_lens_is_undone():
     path = real("hypernerf") / "camera-with-distortion" / "camera.json"
     camera = read_camera(path, 0.1, 2.0)

@@ -6,6 +6,7 @@ import re
 import shutil
 import unicodedata
 from dataclasses import replace
+from zlib import crc32
 
 import numpy as np
 import pytest
@@ -484,6 +485,25 @@ def test_a_key_that_is_null_is_absent(tmp_path, made):
     assert read_scene(tmp_path, "toy").protocol == expected
 
 
+def test_an_empty_path_of_a_mask_is_absent(tmp_path, made):
+    made()
+    edit(tmp_path / "toy" / FILE, {f"frames.{i}.mask_path": "" for i in range(10)})
+    assert read_scene(tmp_path, "toy").train[0].load_valid is None
+
+
+def test_images_of_which_some_are_linear_are_told(tmp_path, made):
+    made()
+    path = tmp_path / "toy/images/frame_2.png"
+    content = path.read_bytes()
+    chunk = b"gAMA" + (100000).to_bytes(4, "big")
+    chunk = (4).to_bytes(4, "big") + chunk + crc32(chunk).to_bytes(4, "big")
+    path.write_bytes(content[:33] + chunk + content[33:])  # behind the header
+    said = "\n".join(read_scene(tmp_path, "toy").protocol["assumed"])
+    assert (
+        "1 of 10 images say that they are linear (gAMA 1; frame_2.png, ..), and all are read as sRGB" in said
+    )
+
+
 def test_masks_that_cannot_be_meant_are_refused(tmp_path, masked):
     mask = masked()
     for i in range(10):  # which of two is the subject's?
@@ -612,6 +632,14 @@ def test_cameras_of_a_rig_are_told_apart_and_held_out_by_name(tmp_path):
     assert scene.protocol["test_moments"] == [2]
     data = PosedVideoDataModule(tmp_path, "toy", test_moments=[2], views_per_step=2, rays=8)
     assert {o.moment.camera for o in data.batches.draw().observations} == {0, 1}
+
+
+def test_cameras_may_be_whole_floats(tmp_path):
+    rig(tmp_path / "toy")
+    edit(tmp_path / "toy" / FILE, lambda c: [f.update(camera=float("r" in f["camera"])) for f in c["frames"]])
+    scene = read_scene(tmp_path, "toy", test_cameras=[1])
+    assert {f.name[7:12] for f in scene.train} == {"left_"}
+    assert scene.protocol["test_cameras"] == ["1"]
 
 
 def test_cameras_without_names_are_not_held_out_by_name(tmp_path, made):

@@ -77,6 +77,29 @@ def test_a_matrix_of_intrinsics_is_read_or_told(own, common, focal, told):
     assert bool(lines) == bool(told)
 
 
+@pytest.mark.parametrize(
+    ("model", "terms", "said"),
+    [
+        (
+            "PINHOLE",
+            {"k1": 0.1, "k2": 0},
+            "camera_model: PINHOLE has no k1, which is 0.1 and is undone; write c",
+        ),
+        ("RADIAL", {"k1": 0.1, "k2": 0.1, "p2": 0.01}, "RADIAL has no p2, which is 0.01"),
+        ("SIMPLE_RADIAL", {"k1": 0.1, "k2": 0.0}, None),
+        ("OPENCV", {"k3": 0.1, "p1": 0.01}, None),
+    ],
+)
+def test_a_lens_that_its_model_has_not_is_told(tmp_path, model, terms, said):
+    nothing = dict.fromkeys(("k1", "k2", "k3", "p1", "p2"))
+    edit(write_video(tmp_path / "toy") / posed_video.FILE, nothing | {"camera_model": model} | terms)
+    lines = [
+        line for line in posed_video.read_scene(tmp_path, "toy").protocol["assumed"] if " has no " in line
+    ]
+    assert len(lines) == (said is not None)
+    assert (said or "") in "".join(lines)
+
+
 def test_axes_of_mitsuba_are_named():
     pose = {"transform_matrix": np.eye(4).tolist()}
     assert pose_in(Entry("t.json", pose, common={"from_mitsuba": False}), None, False).shape == (4, 4)
@@ -507,6 +530,13 @@ def test_poses_written_in_another_way_are_refused_with_the_mend(matrix, said):
         ),
         ({"white_transparent": True}, "white_transparent: not read: images show their background; cut the"),
         ({"white_transparent": False, "cameras": [{"id": 0, "place": [0, 0, 0]}]}, None),
+        (
+            {"test_frames": [{"file_path": "a.png"}]},
+            "test_frames: not read, which seem to say what is trained",
+        ),
+        ({"frames.0.split": "val"}, "split: not read, which seem to say what is trained and tested on; name"),
+        ({"frames.0.is_bad": True}, "and remove frames that are bad"),
+        ({f"frames.{i}.is_bad": False for i in range(10)} | {"splits": {}}, None),
         ({"depth_file_path": "a.npy"}, "depth_file_path at the top is not read; write that of each frame"),
     ],
 )

@@ -153,7 +153,10 @@ def read_scene(
     if halve and (size[0] % 2 or size[1] % 2):
         raise mismatch(folder, "even sides to halve", by(size), "set data.half_resolution=false")
     width, height = (n // 2 if halve else n for n in size)
-    cut_out = [record.path for record in records["train"] if record.has_alpha and record.mask is None]
+    cut_out = {
+        split: [record.path for record in records[split] if record.has_alpha and record.mask is None]
+        for split in SPLITS
+    }
     premultiplied, told = alpha_of(alpha, cut_out, folder)
     assumed += told
 
@@ -161,16 +164,16 @@ def read_scene(
     is_metric = any(record.depth for record in everything) or (folder / "trajectories.npz").exists()
     space, bounds = _space(cameras, str(folder), near, far, box, has_alpha, is_metric)
 
-    def frame(record: _Record) -> Frame:
+    def frame(record: _Record, split: str) -> Frame:
         whole = space.camera(record.camera)
         camera = whole.resized(width, height) if halve else whole
-        load = StoredImage(record.path, size, 1 + halve, record.mask, premultiplied=premultiplied)
+        load = StoredImage(record.path, size, 1 + halve, record.mask, premultiplied=premultiplied[split])
         depth = None
         if record.depth:
             depth = StoredDepth(record.depth[0], whole, halve, record.depth[1], depth_kind or "ray")
         return Frame(_name(folder, record), record.time, camera, load, depth, record.ability)
 
-    train, val, test = (tuple(map(frame, records[split])) for split in SPLITS)
+    train, val, test = (tuple(frame(record, split) for record in records[split]) for split in SPLITS)
     deep = sorted((f for f in (*train, *val, *test) if f.load_depth), key=lambda f: f.time)
     advice = "write depth_scale: {} beside the frames"
     sensed = [*map(_sensed, deep)]

@@ -390,8 +390,8 @@ def left_out(others: Mapping[Path, Path], folder: Path) -> list[str]:
 
 
 def stated(content: Mapping) -> dict:
-    """Leave out keys whose value is null: they say nothing."""
-    return {key: value for key, value in content.items() if value is not None}
+    """Leave out keys whose value is null or an empty text: they say nothing."""
+    return {key: value for key, value in content.items() if value is not None and value != ""}
 
 
 def frames_of(file: Path, content: dict) -> list[Entry]:

@@ -18,6 +18,7 @@ unscaled world; all else is in pixels of the full-size image. Old files say ``ta
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -61,11 +62,20 @@ from forewarp.data.images import (
     check_pixels,
     exif_turned,
     inspect_image,
+    mixed_linear,
     write_image,
 )
 from forewarp.data.names import in_order, read_names
-from forewarp.data.transforms import check_pinhole, check_times, with_images, with_suffix
+from forewarp.data.transforms import (
+    LIKE_LENS,
+    beside_images,
+    check_pinhole,
+    check_times,
+    with_images,
+    with_suffix,
+)
 from forewarp.files import write_json
+from forewarp.ops.backend import is_number
 from forewarp.scene.camera import Camera, Lens
 from forewarp.scene.frame import Frame, Scene, Truth, middle_of
 
@@ -73,6 +83,16 @@ _SCALES, _ASPECTS = (1e-6, 1e6), (1e-2, 1e2)
 _MOST_PIXELS, _MOST_PIXELS_OFF, _MOST_BENT = 1e5, 1e7, 1e3  # beyond them a camera file is wrong
 _OUTSIDE = 0.1  # share of keypoints outside the images, from which on they are of others
 _MOST_MOMENTS, _RATES = 1e9, (1e-3, 1e5)
+_INTERPOLATION = "interpolation"
+_LENS_KEYS = (
+    "focal_length",
+    "pixel_aspect_ratio",
+    "skew",
+    "principal_point",
+    "radial_distortion",
+    "tangential_distortion",
+)
+_LIKE_FOCAL = re.compile("(?i)f_?[xy]|fl_?[xy]|focal.*|(pixel_?)?aspect.*")
 _EVERY = 4  # the published interpolation protocol: train on every fourth, test midway between
 
 
@@ -157,17 +177,23 @@ def read_scene(
         test_ids = _names(wheres[1], "frame_names", read_json(wheres[1]), ids, train_ids)
         how = f"splits/{of_train}.json and {of_test}.json"
     numbers, camera_ids, assumed = _read_items(folder / "metadata.json", ids)
+    if how == _INTERPOLATION and _are_out_of_order(ids, numbers, camera_ids):
+        train_ids, test_ids = _every_fourth(sorted(ids, key=numbers.get))
+        line = "ids are not in the order of time, in which every fourth is trained on"
+        assumed.append(f"{folder / 'dataset.json'}: {line}; list train_ids and val_ids to choose others")
     first, last = min(numbers.values()), max(numbers.values())
     where = f"{folder / 'dataset.json'}: ids"
     paths = {item: with_suffix(inside(images, item, where)) for item in ids}
     there, told = with_images(ids, list(paths.values()), where)
-    assumed += told
+    advice = "remove those that are not meant"
+    assumed += [*told, *beside_images([paths[item] for item in there], where, advice)]
     train_ids, test_ids = ([item for item in part if item in set(there)] for part in (train_ids, test_ids))
     for part, names in (("train_ids", train_ids), ("val_ids", test_ids)):
         if not names:
             raise mismatch(folder / "dataset.json", f"an image of {part} that is there", "none")
 
-    poses, turned, depths, unit = [], [], {}, size  # poses of the unscaled world, images that EXIF turns
+    poses, headers, depths, unit = [], {}, {}, size  # poses of the unscaled world
+    unread: dict[str, None] = {}  # keys of lenses
     if depth is not None:
         place = inside(folder, depth, "data.depth") / f"{scale}x"
         depths = depths_beside(place, train_ids)
@@ -176,13 +202,15 @@ def read_scene(
 
     def frame(item: str) -> Frame:
         path = paths[item]
-        camera = read_camera(inside(folder / "camera", f"{item}.json", where), near, far)
+        file = inside(folder / "camera", f"{item}.json", where)
+        entry = Entry(file, read_json(file))
+        camera = _camera_of(entry, near, far)
+        unread.update(dict.fromkeys(_unread_lens(entry, camera)))
         poses.append(camera.camera_to_world)
         camera = normalised.camera(camera).smaller(scale)
         size = camera.width, camera.height
         header, options = inspect_image(path, size, f", the camera's image_size / {scale}"), {}
-        if header.is_turned:
-            turned.append(path)
+        headers[path] = header
         if header.has_alpha and masks is None:
             options["load_valid"] = StoredMask(path, size, of_alpha=True)
         if item in depths:
@@ -227,7 +255,11 @@ def read_scene(
     if (folder / "extra.json").is_file():
         extra = Entry(folder / "extra.json", read_json(folder / "extra.json"))
         seconds = (last - first) / extra.number("fps", *_RATES)
-    assumed += exif_turned(turned, images)
+    assumed += exif_turned([path for path, header in headers.items() if header.is_turned], images)
+    assumed += mixed_linear(headers, images)
+    if unread:
+        line = f"{', '.join(unread)}: not read, which seem to be of the lens"
+        assumed.append(f"{folder / 'camera'}: {line}; write them as {', '.join(_LENS_KEYS)}")
     known = [folder / name for name in ("confidence", *([] if depth is None else [depth]))]
     assumed += side_files(
         [folder, images], known, "set data.depth (data=iphone) for depth, cut masks into alpha"
@@ -318,7 +350,10 @@ def read_camera(path: Path, near: float, far: float) -> Camera:
         SceneError: for a key that is missing or has a wrong number of values, for no rotation, and for a lens
             that cannot be undone.
     """
-    entry = Entry(path, read_json(path))
+    return _camera_of(Entry(path, read_json(path)), near, far)
+
+
+def _camera_of(entry: Entry, near: float, far: float) -> Camera:
     check_pinhole(entry)
     width, height = entry.numbers("image_size", 2, 1, _MOST_PIXELS)
     if width % 1 or height % 1:
@@ -339,6 +374,24 @@ def read_camera(path: Path, near: float, far: float) -> Camera:
     camera = Camera(int(width), int(height), focal, focal * aspect, cx, cy, pose, near, far, skew, lens)
     check_camera(camera, entry.where("principal_point"), entry.where("radial_distortion"))
     return camera
+
+
+def _unread_lens(entry: Entry, camera: Camera) -> list[str]:
+    """List the keys that seem to be of the lens and are not read, where they say another thing."""
+    read = {*_LENS_KEYS} - ({"tangential_distortion"} if "tangential" in entry.own else set())
+    lens = camera.lens or Lens()
+    known = [0, camera.fx, camera.fy, camera.cx, camera.cy, camera.fy / camera.fx, camera.skew]
+    known = np.array([*known, *lens.k, *lens.p])
+
+    def is_new(value: object) -> bool:
+        values = value if isinstance(value, list) else [value]
+        return any(
+            not np.isclose(known, each).any() if is_number(each) else each is not None for each in values
+        )
+
+    keys = [key for key in entry.own if key not in read | {"tangential"}]
+    like = [key for key in keys if LIKE_LENS.fullmatch(key) or _LIKE_FOCAL.fullmatch(key)]
+    return [key for key in like if is_new(entry.own[key])]
 
 
 def write_camera(path: Path, camera: Camera) -> None:
@@ -377,8 +430,23 @@ def _read_split(path: Path) -> tuple[str, list[str], list[str], list[str]]:
     if len(ids) <= _EVERY:
         expected = f"more than {_EVERY} items to test between where val_ids is empty"
         raise mismatch(f"{path}: ids", expected, len(ids))
+    return _INTERPOLATION, ids, *_every_fourth(ids)
+
+
+def _every_fourth(ids: list[str]) -> tuple[list[str], list[str]]:
+    """Split items as the published interpolation protocol does: to train on, and midway to test on."""
     chosen = range(0, len(ids), _EVERY)
-    return "interpolation", ids, [ids[i] for i in chosen], [ids[i + _EVERY // 2] for i in chosen[:-1]]
+    return [ids[i] for i in chosen], [ids[i + _EVERY // 2] for i in chosen[:-1]]
+
+
+def _are_out_of_order(ids: list[str], numbers: dict[str, int], cameras: dict[str, int | None]) -> bool:
+    """Tell whether the items of some camera are not in the order of time."""
+    latest: dict[int | None, int] = {}
+    for item in ids:
+        if numbers[item] < latest.get(cameras[item], 0):
+            return True
+        latest[cameras[item]] = numbers[item]
+    return False
 
 
 def _names(path: Path, key: str, content: dict, ids: list[str] | None = None, train=()) -> list[str]:

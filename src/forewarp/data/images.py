@@ -6,7 +6,7 @@ import io
 import mmap
 import os
 import weakref
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -40,6 +40,7 @@ _OTHER_KINDS = {  # at which byte, which marks tell them
 _ORIENTATION = 0x0112  # EXIF's tag
 _JPEG_END, _JPEG_TAIL = b"\xff\xd9", 4096  # some cameras write a little behind the end
 _LEAST_HIDDEN, _COLORS = 0.01, 64  # share of an image, and colours, that tell an image beneath
+_LINEAR = 0.9  # a PNG's gamma above it, where sRGB's is 0.45
 _LOOKED_AT = 1 << 18  # pixels, so as not to sort those of large images
 _ROUNDED, _STRAY, _LEAST_EDGES, _EDGES_OF = 2, 0.001, 50, 4  # of an edge; share, least edges, images
 _FOREGROUND = 127  # a mask above it is foreground; masks are lossy, so never quite 0 or 255
@@ -119,12 +120,13 @@ CACHE = ImageCache(1_000_000_000)
 @dataclass(frozen=True)
 class Header:
     """What an image says of itself: ``size`` is (width, height) in pixels; ``is_turned`` tells whether it is
-    to be turned before it is shown.
+    to be turned before it is shown, ``is_linear`` whether it says that its colours are no sRGB but light.
     """
 
     size: tuple[int, int]
     has_alpha: bool
     is_turned: bool = False
+    is_linear: bool = False
 
 
 def inspect_image(path: Path, size: tuple[int, int] | None = None, why: str = "") -> Header:
@@ -162,6 +164,15 @@ def exif_turned(paths: Sequence[Path], where: object) -> list[str]:
     line = f"{len(paths)} images are read as stored, although their EXIF orientation turns them"
     advice = "if poses are of the images upright, turn the pixels"
     return [f"{where}: {line} ({paths[0].name}, ..); {advice}"]
+
+
+def mixed_linear(headers: Mapping[Path, Header], where: object) -> list[str]:
+    """Say in a line that some images say that they are linear, and others are not."""
+    linear = [path for path, header in headers.items() if header.is_linear]
+    if len(linear) in (0, len(headers)):
+        return []
+    line = f"{len(linear)} of {len(headers)} images say that they are linear (gAMA 1; {linear[0].name}, ..)"
+    return [f"{where}: {line}, and all are read as sRGB; write all alike"]
 
 
 def common_header(paths: Iterable[Path], one_size: bool = True) -> Header:
@@ -264,43 +275,56 @@ def straight(rgba: Tensor) -> Tensor:
     return torch.cat([colors, alpha], -1)
 
 
-def is_premultiplied(images: Iterable[Tensor]) -> bool:
+def is_premultiplied(images: Iterable[Tensor]) -> bool | None:
     """Tell whether colours of images (H, W, 4) are multiplied by alpha: no edge is brighter than its alpha.
 
     Of straight alpha edges are about as bright as what they are of. Only those tell whose colour, divided by
     alpha, would be at least half as bright as what is opaque: black shadows and outlines are below every
-    alpha. There must be some, and next to no pixel of any alpha may be brighter than it.
+    alpha. There must be some, and next to no pixel of any alpha may be brighter than it. None: no edge tells.
     """
     pixels = torch.cat([rgba.reshape(-1, 4) for rgba in images])
     brightest, alpha = pixels[:, :3].amax(-1).int(), pixels[:, 3].int()
     solid = brightest[alpha == 255]
     if not len(solid):
-        return False
+        return None
     middle, soft = int(solid.median()), (alpha > 0) & (alpha < 255)
     is_lit = (brightest > 2 * _ROUNDED) & (2 * 255 * brightest >= middle * alpha)
     telling = int((soft & is_lit & (2 * alpha < middle)).sum())
     above = int((soft & (brightest > alpha + _ROUNDED)).sum())
+    if max(telling, above) < _LEAST_EDGES:
+        return None
     return telling >= _LEAST_EDGES and above <= _STRAY * telling
 
 
-def alpha_of(alpha: str | None, paths: Sequence[Path], where: object) -> tuple[bool, list[str]]:
-    """Tell whether images are premultiplied, as said or as some of them show; and in a line what they show.
+def alpha_of(
+    alpha: str | None, parts: Mapping[str, Sequence[Path]], where: object
+) -> tuple[dict[str, bool], list[str]]:
+    """Tell of each part whether its images are premultiplied, as said or as some of them show; and in a line
+    what they show.
 
     Args:
-        alpha: straight, premultiplied, or None to look at a few of ``paths``.
-        paths: images with alpha.
+        alpha: straight, premultiplied, or None to look at a few of each part.
+        parts: images with alpha; one whose edges do not tell is as the first that does.
         where: what they belong to.
 
     Raises:
         SceneError: for another value.
     """
     one_of(alpha, "data.alpha", "straight", "premultiplied", None)
-    if alpha is not None or not paths:
-        return alpha == "premultiplied", []
-    if not is_premultiplied(read_image(paths[i]) for i in spread(len(paths), _EDGES_OF)):
-        return False, []
-    line = f"{where}: colours are taken as multiplied by alpha, as no edge is brighter than its alpha"
-    return True, [f"{line}; if they are not, set data.alpha=straight"]
+    if alpha is not None:
+        return dict.fromkeys(parts, alpha == "premultiplied"), []
+    told = {
+        part: is_premultiplied(read_image(paths[i]) for i in spread(len(paths), _EDGES_OF)) if paths else None
+        for part, paths in parts.items()
+    }
+    first = next((is_so for is_so in told.values() if is_so is not None), False)
+    told = {part: first if is_so is None else is_so for part, is_so in told.items()}
+    if not any(told.values()):
+        return told, []
+    some = ", ".join(part for part, is_so in told.items() if is_so)
+    which = "colours" if all(told.values()) else f"colours of {some} images, unlike those of the others,"
+    line = f"{where}: {which} are taken as multiplied by alpha, as no edge is brighter than its alpha"
+    return told, [f"{line}; if they are not, set data.alpha=straight"]
 
 
 def composited(rgba: Tensor, background: Tensor) -> Tensor:
@@ -491,14 +515,16 @@ def _inspect(stream: BinaryIO, path: Path, mode: str = "RGBA") -> Header:
         raise mismatch(path, "a PNG or JPEG image", got, advice) from error
     has_16_bits = ";16" in str(image.tile[0][3])  # the mode alone hides it
     if mode == "I;16" and not (has_16_bits and image.mode.startswith("I")):
-        raise mismatch(path, "a grey PNG of 16 bits a pixel", f"mode {image.mode}")
+        advice = "write it with 16 bits, or as .npy; 8 are too coarse for depth"
+        raise mismatch(path, "a grey PNG of 16 bits a pixel", f"mode {image.mode}", advice)
     if mode == "RGBA" and (has_16_bits or image.mode == "CMYK"):
         got = "16 bits" if has_16_bits else "CMYK"
         raise mismatch(path, "8 bits a channel, grey or RGB", got, "convert the image")
     is_turned = False
     with suppress(Exception):  # a harmed tag, of what no pixel depends on; a PNG's own method would decode it
         is_turned = Image.Image.getexif(image).get(_ORIENTATION, 1) not in (0, 1)
-    header, is_whole = Header(image.size, image.has_transparency_data, is_turned), False
+    is_linear = image.info.get("gamma", 0) > _LINEAR and not {"srgb", "icc_profile"} & image.info.keys()
+    header, is_whole = Header(image.size, image.has_transparency_data, is_turned, is_linear), False
     with suppress(Exception):  # OSError, SyntaxError and more
         is_whole = image.verify() is None if image.format == "PNG" else _has_jpeg_end(stream)
     if not is_whole:

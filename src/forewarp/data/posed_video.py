@@ -198,10 +198,10 @@ def read_scene(
         depth_scale = number_or_none(unit, f"{file}: {key}", 1 / MOST_UNITS)
     assumed += unread_beside(file, content, [entry.path for entry in entries], beside)
     cut_out = [entry.load for entry in entries if entry.is_cut_out]
-    premultiplied, told = alpha_of(alpha, [load.path for load in cut_out], file)
+    premultiplied, told = alpha_of(alpha, {"all": [load.path for load in cut_out]}, file)
     assumed += told
     for load in cut_out:  # none is decoded yet
-        load.premultiplied = premultiplied
+        load.premultiplied = premultiplied["all"]
     names = [entry.name for entry in entries]
     cameras = [entry.camera for entry in entries]
     times, told = times_of(names, [entry.time for entry in entries], str(file), name_pattern, cameras)
@@ -365,6 +365,7 @@ def _read_entries(
         beside = {f"load_{kind}": _motion(image, f"{kind}_path", scale) for kind in ("moving", "resting")}
         beside["load_valid"] = valid
         taken_by = entry.own.get("camera")
+        taken_by = int(taken_by) if isinstance(taken_by, float) and taken_by.is_integer() else taken_by
         taken_by = str(taken_by) if type(taken_by) in (str, int) else None  # an object is another program's
         moment = whole(entry.own["moment"], entry.where("moment"), 0) if "moment" in entry.own else None
         depth = entry.path("depth_file_path") if "depth_file_path" in entry.own else None

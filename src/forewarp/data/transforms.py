@@ -23,7 +23,7 @@ from typing import TypeVar
 import numpy as np
 import torch
 
-from forewarp.data.cameras import FLIP, IN_PIXELS, check_camera, pose_of
+from forewarp.data.cameras import FLIP, IN_PIXELS, SPLITS, check_camera, pose_of
 from forewarp.data.files import (
     SIDE,
     SUFFIXES,
@@ -36,7 +36,7 @@ from forewarp.data.files import (
     one_of,
     side_files,
 )
-from forewarp.data.images import TURN, Header, by, exif_turned, inspect_image
+from forewarp.data.images import TURN, Header, by, exif_turned, inspect_image, mixed_linear
 from forewarp.data.names import LEAST_SPAN, in_order, read_names, refuse_far
 from forewarp.ops.backend import is_number
 from forewarp.scene.camera import Camera, Lens
@@ -50,11 +50,17 @@ _NO_PINHOLE = re.compile(
     "(?i)fish|equi(dist|rect|sol)|pano|spheric|omnidir|ortho|lat_?long|cylind|kannala|thin_?prism|ftheta"
 )
 _UNREAD_LENSES = ("distortion_params", "distortion", "dist_coeffs", "distortion_coefficients", "dist")
-_LIKE_LENS = re.compile(
+LIKE_LENS = re.compile(
     r"(?i)(k_?[1-9]|kappa_?\d|p_?[12]|radial.*|tangential.*|brown.*|.*distort.*|dist_?coe.*|rolling_shutter.*"
     r"|ocam.*|xi|c_?[xy]|pp_?[xy]|principal_?point.*|shift_?[xy])"
 )
-_LENS = ("k1", "k2", "k3", "p1", "p2", "cx", "cy")
+_LENS_TERMS = ("k1", "k2", "k3", "p1", "p2")
+_TERMS = {"PINHOLE": 0, "SIMPLE_PINHOLE": 0, "SIMPLE_RADIAL": 1, "RADIAL": 2}  # of these that models have
+_LENS = (*_LENS_TERMS, "cx", "cy")
+_LIKE_SPLIT = re.compile(
+    "(?i)(is_?)?(train(ing)?|val(idation)?|test(ing)?|eval(uation)?|(hold|held)_?out)"
+    "(_?(frames?|ids?|idxs?|ind(ex|ices)|images?|views?|files?|split|set))?|splits?|(is_?)?bad"
+)
 _PATHS = ("file_path", "mask_path", "depth_file_path", "moving_path", "resting_path")
 _READ = {*_PATHS, "depth_scale", *_LENS, *_UNREAD_LENSES}  # or told elsewhere
 # Matrices of intrinsics, as programs call them.
@@ -132,8 +138,11 @@ def read_frames(
         camera = camera_of(entry, header.size, scale, path, pose=pose, longer=longer)
         time = entry.number("time", -_MOST_TIME, _MOST_TIME) if "time" in entry.own else None
         images.append(ListedImage(entry, path, header, camera, time))
-    assumed += _beside_images(there, file)
+    bare = [path for entry, path in there if Path(entry.get("file_path")).suffix not in SUFFIXES]
+    assumed += beside_images(bare, f"{file}: file_path", "write the one that is meant, or remove the others")
     assumed += unread + exif_turned([image.path for image in images if image.header.is_turned], file)
+    assumed += mixed_linear({image.path: image.header for image in images}, file)
+    assumed += _beyond_model(image.entry for image in images)
     keys = [] if any("time" in entry.own for entry in entries) else _TIMES
     like_times = [key for key in keys if all(type(entry.own.get(key)) in (int, float) for entry in entries)]
     for key in like_times[:1]:
@@ -141,14 +150,30 @@ def read_frames(
     return images, assumed + left_aside((image.entry, image.camera) for image in images)
 
 
-def _beside_images(images: Iterable[tuple[Entry, Path]], file: Path) -> list[str]:
-    """Say in a line where a path without a suffix has images of two kinds."""
-    for entry, path in images:
-        if Path(entry.get("file_path")).suffix not in SUFFIXES:
-            others = [path.with_suffix(s) for s in SUFFIXES if s.lower() != path.suffix.lower()]
-            if other := next((other for other in others if os.path.isfile(other)), None):
-                line = f"{path.name} is read, not {other.name} beside it, as file_path has no suffix"
-                return [f"{file}: {line}; write that which is meant, or remove the other images"]
+def beside_images(images: Iterable[Path], where: str, advice: str) -> list[str]:
+    """Say in a line where an image that is named without a suffix has another of its name beside it.
+
+    Args:
+        images: that are named so, and read.
+        where: what names them.
+        advice: what to do.
+    """
+    for path in images:
+        others = [path.with_suffix(s) for s in SUFFIXES if s.lower() != path.suffix.lower()]
+        if other := next((other for other in others if os.path.isfile(other)), None):
+            return [f"{where}: no suffix: {path.name} is read, not {other.name} beside it; {advice}"]
+    return []
+
+
+def _beyond_model(entries: Iterable[Entry]) -> list[str]:
+    """Say in a line where a camera model has no such term of a lens as is there."""
+    for entry in entries:
+        model = entry.get("camera_model")
+        beyond = _LENS_TERMS[_TERMS.get(model, len(_LENS_TERMS)) :]
+        if key := next((key for key in beyond if entry.get(key) not in (None, 0)), None):
+            said = f"{model} has no {key}, which is {short(entry.get(key))} and is undone"
+            advice = f"write camera_model OPENCV if that is right, or {key} 0 if the images have no such lens"
+            return [f"{entry.where('camera_model')}: {said}; {advice}"]
     return []
 
 
@@ -170,7 +195,7 @@ def unread_beside(
     folders = [file.parent, *(image.parent for image in images)]
     lines = side_files(folders, read, "name them in each frame by mask_path or depth_file_path")
     keys = dict.fromkeys([*content, *(key for entry in entries for key in entry.own)])
-    like = [key for key in keys if key not in _READ and (SIDE.search(key) or _LIKE_LENS.fullmatch(key))]
+    like = [key for key in keys if key not in _READ and (SIDE.search(key) or LIKE_LENS.fullmatch(key))]
     like += [key for key in ("lens",) if key in keys and isinstance(content.get(key), dict)]
 
     def is_said(value: object) -> bool:
@@ -190,6 +215,7 @@ def unread_beside(
     if cut:
         advice = "cut the subject out by alpha, or name masks by mask_path and set data.masks=alpha"
         lines.append(f"{file}: {cut[0]}: not read: images show their background; {advice}")
+    lines += _unread_splits(file, content, entries)
     if "depth_file_path" in entries[0].common:
         lines.append(f"{file}: depth_file_path at the top is not read; write that of each frame into it")
     if not like:
@@ -197,6 +223,21 @@ def unread_beside(
     advice = "masks are read from mask_path, depth from depth_file_path, a lens from k1 k2 k3 p1 p2 and cx cy"
     said = f"{', '.join(like[:4])}: not read, which seem to be masks, depth or a lens"
     return [f"{file}: {said}; {advice}", *lines]
+
+
+def _unread_splits(file: Path, content: dict, entries: Sequence[Entry]) -> list[str]:
+    """Say in a line which keys seem to say what is trained and tested on, and are not read."""
+    keys = [key for key in dict.fromkeys(key for entry in entries for key in entry.own)]
+    keys = [key for key in keys if len({str(entry.own.get(key)) for entry in entries}) > 1]
+    keys = [] if any(f"{split}_filenames" in content for split in SPLITS) else keys
+    keys += [key for key, value in content.items() if isinstance(value, (list, dict)) and value]
+    keys = [key for key in keys if _LIKE_SPLIT.fullmatch(key)]
+    if not keys:
+        return []
+    is_one = file.stem == "transforms"
+    how = "name frames in train_filenames and test_filenames" if is_one else "write each split into its file"
+    said = f"{', '.join(keys)}: not read, which seem to say what is trained and tested on"
+    return [f"{file}: {said}; {how}, and remove frames that are bad"]
 
 
 def _cameras_elsewhere(content: Mapping) -> str | None:
