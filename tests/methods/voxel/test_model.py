@@ -16,7 +16,7 @@ from forewarp.methods.voxel.structure import NAMES
 from forewarp.ops.grid import neighbour_pairs
 from forewarp.renderer import Marched
 from forewarp.scene.box import Lattice
-from forewarp.scene.cloud import Handover
+from forewarp.scene.cloud import Cloud, Handover
 from forewarp.scene.view import Moment
 from forewarp.training.checkpoints import make_handover
 from tests.support import tiny_scene as tiny
@@ -150,6 +150,12 @@ def test_learned_nodes_begin_with_the_motion_of_another_method():
     first = Turning().trajectories(points, torch.tensor([SCENE.canonical_time]))
     expected = points[:, None] + Turning().trajectories(points, times) - first
     torch.testing.assert_close(after.trajectories(points, times), expected, atol=5e-3, rtol=0)
+    told = "motion begins as that of another method (carry)"
+    cloud = Cloud(points, points, torch.ones(50), 0.1)
+    handover = Handover(tiny.BOX, True, 6, cloud, times, Turning().trajectories(points, times))
+    blank = Start(SCENE, "fine", {"num_voxels": [[0, 1500]]}, range(6), handover, blank=True)
+    assert told in model(blank).departures()
+    assert told not in fresh(model).departures()
     f2 = tiny.forward_model()
     still = carried(Turning(), Handover(tiny.BOX, True, 6), f2).trajectories(points, times)
     assert torch.equal(still[:, 0], still[:, 1])

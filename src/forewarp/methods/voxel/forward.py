@@ -75,6 +75,11 @@ class ForwardWarp(VoxelMethod):
             other = "set it to 2, or choose model/inpainter=none"
             check_value("model.upsampler.scale", scale, wanted, lambda scale: scale == int(scale), other)
         self.begin(start)
+        left, takes = start.handover, self.moves and self.stage.carry != "none"
+        # Only voxels leave the length of their density; checkpoints need no note of it, as handovers stay.
+        self.handed = (
+            takes and left is not None and left.paths is not None and "density_scale" not in left.notes
+        )
         if self.moves and not start.blank:
             self.begin_motion(start)
 
@@ -147,9 +152,11 @@ class ForwardWarp(VoxelMethod):
             "learning rates end at lr_final_factor times the first (printed: constant)": True,
         }
         if self.motion is not None:
+            learned = self.motion.trajectory.learned is not None
             notes |= {
                 "motion (F2) at the nodes of a coarse lattice": self.motion.trajectory.at_nodes,
-                "learned at these nodes, without the network F2": self.motion.trajectory.learned is not None,
+                "learned at these nodes, without the network F2": learned,
+                "motion begins as that of another method (carry)": learned and self.handed,
                 "cosines of a longer period (padding)": self.motion.trajectory.padding > 0,
                 "matter fades where little of it is splatted (tau, fade)": True,
             }
