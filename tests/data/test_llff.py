@@ -37,6 +37,12 @@ def test_a_row_of_poses_for_each_image_is_one_film(folder):
     assert scene.protocol["near"] / scene.protocol["normalisation"]["scale"] == pytest.approx(14)
 
 
+@pytest.mark.parametrize("option", [{"axes": "opencv"}, {"inverse": True}])
+def test_axes_and_direction_of_rows_are_fixed(folder, option):
+    with refused(f"data.{next(iter(option))}: expected none with poses_bounds.npy"):
+        read_scene(folder.parent, "toy", **option)
+
+
 def test_readers_send_to_each_other_in_no_circle(folder):
     with refused("neither; of images/ by one camera that moves: use experiment=video_with_poses"):
         read_rig(folder.parent, "toy")

@@ -284,6 +284,40 @@ def test_names_of_many_cameras_are_shortened():
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize(
+    ("numbers", "says"),
+    [
+        ((0, 1), None),
+        ((1, 2), None),
+        ((2, 3), "cam01: expected all 4 frames, as cam00.mp4 has, but got 2, from 0002.png to 0003.png"),
+        ((0, 2), "cam01: expected all 4 frames"),
+        ((10, 20, 30, 40), None),
+    ],
+)
+def test_frames_in_a_folder_are_compared_with_the_films_beside_it(films, tmp_path, numbers, says):
+    folder = shutil.copytree(films / "toy", tmp_path / "toy")
+    (folder / "cam01.mp4").unlink()
+    for number in numbers:
+        write_image(folder / "cam01" / f"{number:04d}.png", grey(CAMERAS[1], number, 1))
+    if says:
+        with refused(says):
+            read_scene(tmp_path, "toy")
+        return
+    scene = read_scene(tmp_path, "toy")
+    assert scene.protocol["frames"] == len(numbers)
+    line = (
+        f"{folder}: cam01 has 2 frames, others up to 4: all are cut to the first 2; a film that begins later"
+    )
+    assert ("".join(scene.protocol.get("assumed", ())).startswith(line)) == (len(numbers) == 2)
+
+
+def test_a_film_that_may_begin_later_is_said_also_of_few_frames(films, tmp_path):
+    folder = shutil.copytree(films / "toy", tmp_path / "toy")
+    write_film(folder / "cam01.mp4", numbered(3, (32, 48)), stamps="N*1000/30")
+    (line,) = read_scene(tmp_path, "toy", frames=2).protocol["assumed"]
+    assert "cam01.mp4 has 3 frames, others up to 4: all are cut to the first 2; a film that begins" in line
+
+
 def test_films_of_two_rates_or_none_at_all_are_refused(films, tmp_path):
     folder = shutil.copytree(films / "toy", tmp_path / "toy")
     write_film(folder / "cam01.mp4", numbered(6, (32, 48)), stamps="N*40")

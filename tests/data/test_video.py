@@ -6,10 +6,11 @@ import imageio_ffmpeg
 import numpy as np
 import pytest
 
+from forewarp.capture.frames import measure
 from forewarp.data import video
 from forewarp.data.files import SceneError
-from forewarp.data.video import extracted, header_of, stamps_of
-from tests.support.films import numbered, write_film
+from forewarp.data.video import converted, doubts_of, extracted, header_of, stamps_of
+from tests.support.films import numbered, write_film, write_planes
 
 
 @pytest.mark.parametrize("late", [0, 500])
@@ -69,3 +70,71 @@ def test_of_several_streams_the_film_is_taken_not_a_cover_or_a_preview(tmp_path)
         frames = [*extracted(both, [0, 11], None)]
         assert [frame.shape for frame in frames] == [(48, 64, 3)] * 2
         assert header_of(both).count("Video:") == 1
+
+
+@pytest.mark.parametrize(
+    ("options", "suffix", "said"),
+    [
+        (("-c:v", "prores_ks", "-pix_fmt", "yuva444p10le"), "mov", "its alpha is not read"),
+        (("-c:v", "png", "-pix_fmt", "rgba"), "mkv", "its alpha is not read"),
+        (("-c:v", "gif", "-pix_fmt", "rgb8"), "gif", ""),
+        ((), "mp4", ""),
+    ],
+)
+def test_alpha_that_is_not_read_is_said(tmp_path, options, suffix, said):
+    film = write_film(tmp_path / f"a.{suffix}", numbered(3), options=options)
+    assert said in "".join(doubts_of(film))
+    assert bool(said) == bool(doubts_of(film))
+
+
+TO_709 = {  # columns: the light of red, green and blue, of wider primaries
+    "bt2020": [[1.6605, -0.5876, -0.0728], [-0.1246, 1.1329, -0.0083], [-0.0182, -0.1006, 1.1187]],
+    "smpte432": [[1.2249, -0.2247, 0], [-0.0420, 1.0419, 0], [-0.0197, -0.0786, 1.0979]],
+}
+
+
+@pytest.mark.parametrize(("primaries", "name"), [("bt2020", "BT.2020"), ("smpte432", "Display P3")])
+def test_wide_colors_of_sdr_become_those_of_bt709(tmp_path, primaries, name):
+    shown = np.kron(np.random.default_rng(0).integers(40, 210, (6, 8, 3)), np.ones((8, 8, 1)))
+    stored = 255 * ((shown / 255) ** 2.4 @ np.linalg.inv(TO_709[primaries]).T) ** (1 / 2.4)
+    planes = stored.round().astype(np.uint8).transpose(2, 0, 1)[[1, 2, 0]]
+    tags = [
+        "-color_primaries",
+        primaries,
+        "-color_trc",
+        "bt709",
+        "-colorspace",
+        "bt709",
+        "-color_range",
+        "tv",
+    ]
+    told = f"scale=out_color_matrix=bt709:out_range=tv,format=yuv444p,setparams=color_primaries={primaries}"
+    told += ":color_trc=bt709:colorspace=bt709:range=tv"
+    film = write_planes(tmp_path / "a.mkv", planes, "gbrp", "-vf", told, *tags, "-c:v", "ffv1")
+    (image,) = extracted(film, [1], None)
+    assert np.abs(image - shown).mean() < 1.5
+    assert converted(film) == [f"{name}, converted to BT.709"]
+
+
+def test_two_pictures_in_a_frame_are_refused_and_one_is_cut_out(tmp_path):
+    film = write_film(tmp_path / "a.mkv", numbered(3), options=("-metadata:s:v", "stereo_mode=left_right"))
+    with pytest.raises(
+        SceneError, match="one lens, but got two pictures .* side by side; type ffmpeg"
+    ) as told:
+        stamps_of(film)
+    words = str(told.value).split("type ffmpeg ")[1].split()
+    ffmpeg = [imageio_ffmpeg.get_ffmpeg_exe(), "-v", "error", *words]
+    subprocess.run(ffmpeg, cwd=tmp_path, check=True)
+    assert next(extracted(tmp_path / "one.mp4", None, None)).shape == (48, 32, 3)
+
+
+@pytest.mark.parametrize("size", [(64, 48), (96, 128)])
+def test_frames_that_change_their_size_are_refused(tmp_path, size):
+    for name, shape in (("1.mkv", (48, 64)), ("2.mkv", size)):
+        write_film(tmp_path / name, numbered(4, shape))
+    (tmp_path / "list").write_text("file '1.mkv'\nfile '2.mkv'\n")
+    joined = ["-f", "concat", "-i", "list", "-c", "copy", "a.mkv"]
+    subprocess.run([imageio_ffmpeg.get_ffmpeg_exe(), "-v", "error", *joined], cwd=tmp_path, check=True)
+    got = f"others of {size[1]} x {size[0]}, .* after 0.12 s; cut it there"
+    with pytest.raises(SceneError, match=f"expected frames of one size and kind, but got {got}"):
+        measure(tmp_path / "a.mkv", lambda *_: None)

@@ -31,7 +31,7 @@ from forewarp.data.files import (
 )
 from forewarp.data.images import bright, by, common_header, read_image, write_image
 from forewarp.data.names import in_order, read_names
-from forewarp.data.video import HDR, Log, decode, deinterlacing, extracted, hdr_of, hdr_unsaid
+from forewarp.data.video import Log, converted, decode, deinterlacing, doubts_of, extracted
 from forewarp.drawing.images import at_most
 from forewarp.files import read_json, write_json
 
@@ -53,10 +53,6 @@ _WHOLE = 0.9  # share of its duration after which a video counts as whole
 NO_MASKS = (
     "expected masks in which what moves is bright, but got none above 127 of 255, nor labels beside 0; write "
     "it as 255 and all else as 0, or leave out masks="
-)
-_UNSAID = (
-    "10 bits or more of BT.2020 without a transfer are taken for SDR; if colours look faded, tag it as HLG "
-    "(ffmpeg -i IN -c copy -color_trc arib-std-b67 OUT.mp4) or PQ (smpte2084)"
 )
 _ASKED = "frames= says so"  # why so many frames are taken
 _DAMAGE = re.compile("partial file|ended prematurely|corrupt")
@@ -165,10 +161,8 @@ def _from_video(folder: Path, source: Source, count: int | None, step: Step, thr
     chosen, times = kept[sharpest(stamps[kept], sharpnesses[kept], count)].tolist(), {}
     bars, stay = bars_of(brightest), source.masks is not None
     assumed = [_told(bars, "stay, as masks= are of whole frames" if stay else "are cut off")]
-    assumed += [_UNSAID if hdr_unsaid(video) else None]
-    transfer, bars = hdr_of(video), (0.0, 0.0) if stay else bars
-    changed = [f"{HDR[transfer]}, tone-mapped to SDR"] if transfer else []
-    changed += ["interlaced, made whole"] if deinterlacing(video) else []
+    assumed += doubts_of(video)
+    bars, changed = (0.0, 0.0) if stay else bars, converted(video)
     with step("taking frames" + (f" ({'; '.join(changed)})" if changed else "")) as progress:
         for index, pixels in zip(chosen, extracted(video, chosen, source.size, threads, bars)):
             name = f"frame_{index + 1:06d}.jpg"

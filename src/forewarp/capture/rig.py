@@ -42,7 +42,7 @@ from forewarp.capture.sync import RATE, Synchrony, is_silent, synchronise
 from forewarp.data.files import mismatch, number
 from forewarp.data.images import by, read_image, write_image
 from forewarp.data.names import in_order, read_names
-from forewarp.data.video import VIDEOS, extracted, sound_of, stamps_of, start_of
+from forewarp.data.video import VIDEOS, doubts_of, extracted, sound_of, stamps_of, start_of
 from forewarp.drawing.images import write_png
 from forewarp.files import folder_written_whole, read_json, write_json
 
@@ -175,7 +175,7 @@ def _recording(name: str, path: Path, rate: float | None, name_pattern: str | No
         order = np.argsort(stamps, kind="stable")
         images, stamps = tuple(images[row] for row in order), stamps[order]
     else:
-        stamps = stamps_of(path)
+        stamps, told = stamps_of(path), [f"{path}: {line}" for line in doubts_of(path)]
     if len(stamps) < 2:
         kind = "pictures" if images else "frames"
         got = f"{len(stamps)} {kind}" if len(stamps) else "another file"

@@ -50,7 +50,7 @@ VOXELS, PARTICLES = "forewarp.methods.voxel.", "forewarp.methods.particles."
 CHOICES = {"effects": ("given", "auto"), "absent": ("refuse", "skip")}
 # The least whole number, whether null is one too, and the range of a number.
 LEAST = {"frames": 2, "view": 0, "points": 1, "size": 16, "views": 1, "sheets": 0, "reduce": 2}
-MAY_BE_NULL = ("size", "views", "reduce", "frames")
+MAY_BE_NULL = ("size", "views", "reduce", "frames", "fps")
 RANGES = {"fps": (0.1, 1000), "time": (0, 1), "tail": (0.01, 1)}
 
 

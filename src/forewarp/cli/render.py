@@ -18,7 +18,8 @@ What one types most:
   path=orbit time=0.5           once around, at one time
   path=both                     once around while time passes
   path=trajectories             as fixed, with the trajectories of points on the moving surface drawn over it
-  frames=N fps=N size=N         how many, how fast, pixels of the longer side (as the images, at least 400)
+  frames=N fps=N size=N         how many, how many a second (20; with frames= alone as many as keep a film's
+                                speed), pixels of the longer side (as the images, at least 400)
   view=N                        the test view that it shows or starts from
   format=mp4|gif|png            a video, an animated picture, one picture a frame
   layer=moving|resting          only the particles that move, or those that rest, whose holes in a film get
@@ -39,6 +40,7 @@ from forewarp.runs.overrides import next_command
 
 HALF = 0.5  # share of a pixel, above which it counts as what fills it
 _FRAMES, _MOST_FRAMES = 60, 1200  # of a video whose length nothing tells, and at most without frames=
+_RATE = 20.0  # frames a second
 LEAST_SIZE = 400  # pixels of the longer side, unless size= asks for another
 
 
@@ -63,26 +65,46 @@ def write_film(config, run, module) -> Path:
     Without a ``path`` the config gets the one that suits the scene.
     """
     from forewarp.drawing.images import write_video
+    from forewarp.evaluation.images import FILMED
     from forewarp.progress import Counted
     from forewarp.runs.fitted import film_of
 
     film = film_of(run)
     config.path = config.path or ("fixed" if film is None else "as_filmed")
     name = config.path if config.layer == "all" else f"{config.path}_{config.layer}"
-    folder = Path(run.folder) / "videos"
+    folder, seconds = Path(run.folder) / "videos", run.datamodule.scene.protocol.get("seconds")
+    count, fps = pace(config.frames, config.fps, seconds if config.path in FILMED else None)
     with Counted(config.path) as progress:
-        pictures = pictures_of(config, module, run.datamodule, film, folder / f"{name}_masks", progress)
-        return write_video(folder / f"{name}.{config.format}", pictures, fps=float(config.fps))
+        masks = folder / f"{name}_masks"
+        pictures = pictures_of(config, module, run.datamodule, count, film, masks, progress)
+        return write_video(folder / f"{name}.{config.format}", pictures, fps=fps)
 
 
-def pictures_of(config, module, datamodule, film, masks: Path, progress):
-    """Render the pictures of the video that the config describes, and report each to ``progress``.
+def pace(frames: int | None, fps: float | None, seconds: float | None) -> tuple[int, float]:
+    """Choose how many pictures a video has, and how many a second.
+
+    Args:
+        frames, fps: as asked for. Where not both are, a film keeps its speed.
+        seconds: how long the film lasts whose path is followed; None: nothing tells.
+
+    >>> pace(None, None, 3.0), pace(20, None, 10.0), pace(20, 30, 10.0), pace(None, 25, 100.0)
+    ((60, 20.0), (20, 2.0), (20, 30.0), (1200, 12.0))
+    """
+    rate = float(fps or _RATE)
+    lasts = round(seconds * rate) if seconds else _FRAMES
+    count = frames or min(max(lasts, 2), _MOST_FRAMES)
+    is_kept = count == lasts or not seconds or (frames and fps)
+    return count, rate if is_kept else count / seconds
+
+
+def pictures_of(config, module, datamodule, count: int, film, masks: Path, progress):
+    """Render ``count`` pictures of the video that the config describes, and report each to ``progress``.
 
     If it asks for them, write for each which of its pixels are mostly what moves, ``masks/0000.png`` ...
     """
     from forewarp.drawing.images import keep_first, write_png
     from forewarp.evaluation.filmed import Fade
-    from forewarp.evaluation.images import FILMED, Filled, make_shots, moving_share, sized, video
+    from forewarp.evaluation.images import Filled, make_shots, moving_share, sized, video
     from forewarp.evaluation.layers import layer_of, moving_rows
     from forewarp.evaluation.trajectories import Trajectories
 
@@ -102,8 +124,6 @@ def pictures_of(config, module, datamodule, film, masks: Path, progress):
     camera = target.frame.camera
     start = sized(camera, config.size or max(camera.width, camera.height, LEAST_SIZE))
     seconds = datamodule.scene.protocol.get("seconds")
-    lasts = round(seconds * config.fps) if seconds and config.path in FILMED else _FRAMES
-    count = config.frames or min(max(lasts, 2), _MOST_FRAMES)
     shots = make_shots(config.path, count, float(config.time), start, cameras, film, seconds)
 
     def pictures():

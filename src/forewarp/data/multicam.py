@@ -52,7 +52,7 @@ from forewarp.data.images import (
 )
 from forewarp.data.names import in_order, read_names
 from forewarp.data.rigs import held_cameras, held_moments, split_rig
-from forewarp.data.video import VIDEOS, extracted, stamps_of
+from forewarp.data.video import VIDEOS, doubts_of, extracted, stamps_of
 from forewarp.files import written_whole
 from forewarp.scene.camera import Camera
 from forewarp.scene.frame import Frame, Scene, middle_of, spread
@@ -371,22 +371,28 @@ def _look(path: Path, name_pattern: str | None) -> _Track:
     first = next(extracted(path, [0], None), None) if len(stamps) else None
     if first is None:
         raise mismatch(path, "a video", "another file", "copy it again")
-    return _Track(path, first.shape[1::-1], stamps)
+    told = [f"{path}: {line}" for line in doubts_of(path)]
+    return _Track(path, first.shape[1::-1], stamps, told=told)
 
 
 def _moments(tracks: Sequence[_Track], most: int | None, folder: Path) -> tuple[int, list[str]]:
     """Count the moments that all cameras have, ``most`` at most; say in a line where some have more.
 
     Raises:
-        SceneError: naming a camera whose frames are of other times than the first's, or numbered otherwise.
+        SceneError: naming a camera whose frames are of other times than the first's, or numbered otherwise; a
+            folder beside films that lacks frames.
     """
     lengths = [len(track) if most is None else min(len(track), most) for track in tracks]
     count, assumed = min(lengths), []
-    if count < max(lengths):
-        least = tracks[lengths.index(count)].path.name
-        line = f"{folder}: {least} has {count} frames, others up to {max(lengths)}: all are cut to the first"
-        assumed = [f"{line} {count}"]
     films = [track for track in tracks if track.stamps is not None]
+    if films:  # names of images tell their moments
+        lengths = [len(track) for track in tracks]
+    if min(lengths) < max(lengths):
+        least = tracks[lengths.index(min(lengths))].path.name
+        line = f"{folder}: {least} has {min(lengths)} frames, others up to {max(lengths)}: all are cut to the"
+        assumed = [
+            f"{line} first {count}" + ("; a film that begins later is of other moments" if films else "")
+        ]
     for film in films[1:] if count > 1 else ():
         mine, first = ((f.stamps[:count] - f.stamps[0]) for f in (film, films[0]))
         apart = np.abs(mine - first) * (count - 1) / first[-1]  # in frames
@@ -397,6 +403,12 @@ def _moments(tracks: Sequence[_Track], most: int | None, folder: Path) -> tuple[
             got = f"{rates[1]:.4g} a second, {abs(mine[at] - first[at]):.3g} s apart at frame {at}"
             raise mismatch(film.path, expected, got, "convert all to one constant rate, or remove the camera")
     folders = [track for track in tracks if track.images]
+    for track in folders if films else ():
+        first, steps = track.numbers[0], np.diff(track.numbers[:count])
+        if (first > 1 or (steps != 1).any()) and len(track) != len(films[0]):
+            expected = f"all {len(films[0])} frames, as {films[0].path.name} has"
+            got = f"{len(track)}, from {track.images[0].name} to {track.images[-1].name}"
+            raise mismatch(track.path, expected, got, "extract them all, or the same ones of each film")
     numbers = [_numbers([path.stem for path in track.images[:count]]) for track in folders]
     for track, mine in zip(folders[1:], numbers[1:]):
         for at in range(count):

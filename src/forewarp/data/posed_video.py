@@ -182,6 +182,12 @@ def read_scene(
     folder, ordered = scene_folder(root, scene, "nerfstudio"), []
     file = folder / FILE
     if layout_of(folder) == "LLFF":
+        if axes == "opencv" or inverse:
+            expected = (
+                f"none with {llff.FILE}, whose rows are camera-to-world with axes down, right, backwards"
+            )
+            key = "data.axes" if axes == "opencv" else "data.inverse"
+            raise mismatch(key, expected, axes if axes == "opencv" else inverse, "leave it out")
         file, (content, ordered) = folder / llff.FILE, llff.as_transforms(folder)
     else:
         content = stated(read_json(file))

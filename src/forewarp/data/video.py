@@ -21,6 +21,16 @@ VIDEOS = (".mp4", ".mov", ".mkv", ".avi", ".webm")  # suffixes of a rig's films,
 _STAMP = re.compile(r"Parsed_showinfo.* n: *\d+ .* pts_time:(\S+)")
 _DURATION = re.compile(r"Duration: (\d+):(\d+):([\d.]+)")
 HDR = {"arib-std-b67": "HLG", "smpte2084": "PQ"}
+_WIDE = {"bt2020": "BT.2020", "smpte431": "DCI-P3", "smpte432": "Display P3"}
+_PRIMARIES = re.compile(r"Video: .*\((?:[^)]*, ?)?[\w-]+/(" + "|".join(_WIDE) + r")/([\w-]+)")
+_CURVES = ("bt709", "smpte170m", "iec61966-2-1", "bt2020-10", "bt2020-12")  # of SDR that zscale knows
+_ALPHA = re.compile(
+    r"Video: (?!gif)[^,]*, (?:yuva|gbrap|rgba|bgra|argb|abgr|ya8|ya16|ayuv|vuya)|(?i:alpha_mode) *: 1"
+)
+# Two pictures in a frame, and directions all around.
+_STEREO = re.compile(r"(?i)stereo ?3d: (side by side|top and bottom)")
+_SPHERICAL = re.compile(r"(?i)spherical[^:\n]*: ((?:half )?equirectangular|cubemap|fisheye)")
+_CHANGED = re.compile(r"because video parameters changed to (.*), (\d+)x(\d+)")
 _TRANSFER = re.compile(r"Video: .*\b(" + "|".join(HDR) + r")\b")
 # Of more than 8 bits, with matrix/primaries/transfer of which one of the first is BT.2020's, the last none.
 _UNSAID = re.compile(
@@ -41,6 +51,12 @@ _TO_SDR = (
     "zscale=tin={0}:pin=bt2020:min=bt2020nc:t=linear:npl=203:agamma=false,format=gbrpf32le,zscale=p=bt709,"
     "tonemap=mobius:param=0.8:peak=4.9:desat=0,zscale=t=bt709:m=bt709:r=pc"
 )
+_TO_BT709 = "format=gbrp16le,zscale=tin={1}:pin={0}:min=gbr:rin=pc:t={1}:p=bt709:m=gbr:r=pc"
+_UNTOLD = (
+    "10 bits or more of BT.2020 without a transfer are taken for SDR; if colours look faded, tag it as HLG "
+    "(ffmpeg -i IN -c copy -color_trc arib-std-b67 OUT.mp4) or PQ (smpte2084)"
+)
+_HIDDEN = "its alpha is not read, so what it hides is shown; to cut out, give images= of its frames as PNG"
 
 
 def extracted(
@@ -81,6 +97,7 @@ def extracted(
     transfer = hdr_of(video)
     filters = "setparams=colorspace=bt709," + filters if _is_untagged_hd(video) else filters
     filters += f",{_TO_SDR.format(transfer)}" if transfer else ""
+    filters += f",{_TO_BT709.format(*wide)}" if (wide := _wide_of(video)) else ""
     frames = decode(video, f"{filters},format=rgb24", "ppm", Log(), threads, start)
     if chosen is None or is_told:
         yield from frames
@@ -95,9 +112,26 @@ def hdr_of(video: Path) -> str | None:
     return match and match[1]
 
 
-def hdr_unsaid(video: Path) -> bool:
-    """Tell whether a video may be HDR, by 10 bits and BT.2020, but does not say its transfer."""
-    return _UNSAID.search(header_of(video)) is not None
+def converted(video: Path) -> list[str]:
+    """Say what is converted: HDR to SDR, the primaries of wide colours to BT.709's, half frames to whole."""
+    transfer, wide = hdr_of(video), _wide_of(video)
+    lines = [f"{HDR[transfer]}, tone-mapped to SDR"] if transfer else []
+    lines += [f"{_WIDE[wide[0]]}, converted to BT.709"] if wide else []
+    return lines + (["interlaced, made whole"] if deinterlacing(video) else [])
+
+
+def doubts_of(video: Path) -> list[str]:
+    """Say what of a video is not read, or may be meant otherwise: its alpha; that it may be HDR, by 10 bits
+    and BT.2020, but does not say its transfer.
+    """
+    told = header_of(video)
+    return [line for line, said in ((_UNTOLD, _UNSAID), (_HIDDEN, _ALPHA)) if said.search(told)]
+
+
+def _wide_of(video: Path) -> tuple[str, str] | None:
+    """Return ffmpeg's names of the primaries of an SDR video, where wider than BT.709's, and its transfer."""
+    match = None if hdr_of(video) else _PRIMARIES.search(header_of(video))
+    return match and (match[1], match[2] if match[2] in _CURVES else "bt709")
 
 
 def deinterlacing(video: Path) -> str:
@@ -120,7 +154,8 @@ def header_of(video: Path) -> str:
 
     Raises:
         OSError: where there is none.
-        ValueError: for a pipe or a device, and for frames of more than ``MOST_PIXELS``.
+        ValueError: for a pipe or a device, for frames of more than ``MOST_PIXELS``, of two pictures side by
+            side, and of 360 degrees.
     """
     return _header_and_stream(video)[0]
 
@@ -147,6 +182,13 @@ def _header(video: Path, size: int, changed: int) -> tuple[str, str]:
         best = max(names, key=shown.get)
         others = {line for name, line in zip(names, streams) if name != best}
         told = "".join(line for line in lines if line not in others)
+    if both := _STEREO.search(told):
+        part = "iw/2:ih" if both[1][0] in "sS" else "iw:ih/2"
+        advice = f"type ffmpeg -i {video.name} -vf crop={part}:0:0 one.mp4"
+        raise mismatch(video, "a film by one lens", f"two pictures in each frame, {both[1]}", advice)
+    if all_around := _SPHERICAL.search(told):
+        advice = f"type ffmpeg -i {video.name} -vf v360=e:flat:h_fov=90:v_fov=60 front.mp4"
+        raise mismatch(video, "a film in perspective", f"one of 360 degrees, {all_around[1]}", advice)
     return told, best
 
 
@@ -192,11 +234,11 @@ def sound_of(video: Path, rate: int, most: float) -> np.ndarray:
 
 class Log:
     """What ffmpeg says while it runs: ``duration`` in seconds, 0 where unknown; ``stamps`` of the frames so
-    far; all other lines, ``rest``.
+    far; ``changed``, from when on frames are of which other size or colours; all other lines, ``rest``.
     """
 
     def __init__(self) -> None:
-        self.duration, self.stamps, self.rest = 0.0, [], []
+        self.duration, self.stamps, self.rest, self.changed = 0.0, [], [], None
 
     def read(self, stream) -> None:
         """Read to the end."""
@@ -206,6 +248,9 @@ class Log:
                 self.stamps += [float(match[1])] if match[1] != "NOPTS" else []
             elif match := _DURATION.search(line):
                 self.duration = sum(float(part) * unit for part, unit in zip(match.groups(), (3600, 60, 1)))
+            elif match := _CHANGED.search(line):
+                after = f" after {self.stamps[-1] - self.stamps[0]:.2f} s" if self.stamps else ""
+                self.changed = self.changed or f"others of {match[2]} x {match[3]}, {match[1]},{after}"
             else:
                 self.rest.append(line)
 
@@ -221,7 +266,17 @@ def decode(
         codec: pgm or ppm.
         log: takes what ffmpeg says.
         threads, start: see ``extracted``.
+
+    Raises:
+        SceneError: where frames change their size or colours, as of a phone that is turned: ffmpeg makes all
+            as the first, and counts them anew.
     """
+
+    def refuse_changed() -> None:
+        if log.changed:
+            advice = "cut it there, into films of their own (ffmpeg -i IN -ss FROM -to UNTIL OUT.mp4)"
+            raise mismatch(video, "frames of one size and kind", log.changed, advice)
+
     limit = ["-threads", str(threads or 0)]  # of decoder and encoder
     stream = _header_and_stream(video)[1]
     shape = ["-map", stream, "-vf", filters, "-filter_threads", limit[1], "-fps_mode", "passthrough"]
@@ -233,12 +288,14 @@ def decode(
         reader.start()
         try:
             while (image := _read_netpbm(process.stdout)) is not None:
+                refuse_changed()
                 yield image
         except BaseException:  # also where no more are asked for
             process.kill()
             raise
         finally:
             reader.join()
+    refuse_changed()
 
 
 def _read_netpbm(stream) -> np.ndarray | None:
