@@ -185,6 +185,12 @@ def test_the_alpha_of_an_image_that_was_cut_out_is_the_mask(tmp_path, beneath):
     rgba = np.random.default_rng(0).integers(0, 256, (40, 60, 4), np.uint8)
     mask = np.zeros((40, 60), bool)
     mask[8:30, 10:40] = True
+    if beneath == "image":
+        for some in (mask[:0], mask[:10, :13]):  # frames of little of the subject, or none
+            rgba[..., 3] = 0
+            rgba[: some.shape[0], : some.shape[1], 3] = 255 * some
+            write_image(tmp_path / "mask.png", rgba)
+            assert int(bright(tmp_path / "mask.png").sum()) == some.sum()
     rgba[..., 3] = 255 * mask
     rgba *= np.uint8(mask[..., None] | (beneath == "image"))
     write_image(tmp_path / "mask.png", rgba)

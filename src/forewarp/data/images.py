@@ -433,8 +433,8 @@ class MovingMask(StoredMask):
 def bright(path: Path, size: tuple[int, int] | None = None, of_alpha: bool = False) -> Tensor:
     """Decode what is foreground in a mask, (H, W) bool: where it is above 127; in one with colours, as a
     palette has them for several objects, whatever is not black; in one of small numbers, and in a PNG of few
-    levels that fill areas beside 0, as labels do and soft edges don't, whatever is not 0. Where alpha varies
-    it counts, if colours are one, or those of an image that was cut out.
+    levels that fill areas beside 0, as labels do and soft edges don't, whatever is not 0. An alpha
+    counts instead where colours are one, or those of an image that was cut out.
 
     Args:
         path: of the mask.
@@ -445,9 +445,9 @@ def bright(path: Path, size: tuple[int, int] | None = None, of_alpha: bool = Fal
         SceneError: as ``read_image``.
     """
     rgba = read_image(path, size)
-    if not of_alpha and bool((rgba[..., 3] != rgba[0, 0, 3]).any()):
-        inside = rgba[rgba[..., 3] > _FOREGROUND][:, :3]
-        of_alpha = bool((rgba[..., :3] == rgba[0, 0, :3]).all()) or _are_of_image(inside)
+    if not of_alpha and bool((rgba[..., 3] < 255).any()):
+        colors, inside = rgba[..., :3].reshape(-1, 3), rgba[rgba[..., 3] > _FOREGROUND][:, :3]
+        of_alpha = bool((colors == colors[0]).all()) or any(map(_are_of_image, (colors, inside)))
     values = rgba[..., 3] if of_alpha else rgba[..., :3].amax(-1)
     is_colored = not of_alpha and int((values - rgba[..., :3].amin(-1)).max()) >= _COLORED
     is_labels = not of_alpha and path.suffix.lower() == ".png" and _are_labels(values)
