@@ -36,6 +36,8 @@ BIG = int("9" * 300)
         ),
         ({"objective": "x"}, "objective: expected keys of its own or null, but got 'x'"),
         ({"paths": {"runs": {}}}, "paths.runs: expected a text, but got {}"),
+        ({"trackers": {"tags": 5}}, "trackers.tags: expected a list of texts, but got 5"),
+        ({"stage": {"fine": {"objective": {"every": "x"}}}}, "stage.fine.objective.every: expected keys of"),
         ({"paths": ["x"]}, r"paths: expected keys of its own or null, but got \['x'\]"),
     ],
 )

@@ -54,6 +54,10 @@ def check_outline(config: Mapping, where: str = "") -> None:
             raise ValueError(f"{where}{key}: expected a text, but got {short(value)}")
         if key.rpartition(".")[2] in _FLAGS and type(value) is not bool:
             raise ValueError(f"{where}{key}: expected true or false, but got {short(value)}")
+        if key == "trackers.tags" and not isinstance(value, list | None):
+            raise ValueError(f"{where}{key}: expected a list of texts, but got {short(value)}")
+        if key.endswith("objective.every"):
+            check_section(key, value, optional=True)
         if isinstance(value, int) and abs(value) > _MOST:
             raise ValueError(f"{where}{key}: expected a number of at most 64 bits, but got {short(value)}")
 

@@ -247,6 +247,8 @@ def check_values(config: DictConfig) -> None:
     for key in ("data", "callbacks"):
         if not OmegaConf.is_dict(config.get(key)):
             raise ValueError(f"{key}: expected keys of its own, but got {config.get(key)!r:.80}")
+    if config.data.get("_target_") is None:
+        raise ValueError("data: expected a layout, but got none (_target_); set data=dnerf or the like")
     number(config.get("checkpoint_seconds"), "checkpoint_seconds", 0)
     check_command(config.get("command"), "command")
     for key in ("seed", "data.seed", "data.synthesis.seed"):
