@@ -261,13 +261,21 @@ def ball(premultiplied, brightness=200, size=64):
     return np.rint(np.concatenate([rgb, 255 * alpha], -1)).astype(np.uint8)
 
 
-@pytest.mark.parametrize("in_training", [False, True])
-def test_splits_may_differ_in_how_colours_are_multiplied(tmp_path, in_training):
+@pytest.mark.parametrize(("read", "in_training"), [("dnerf", False), ("dnerf", True), ("video", True)])
+def test_splits_may_differ_in_how_colours_are_multiplied(tmp_path, read, in_training):
     parts = {"train": in_training, "test": not in_training}
     written = {s: [replace(shot, rgba=ball(is_so)) for shot in dnerf_shots(4)] for s, is_so in parts.items()}
     written["val"] = dnerf_shots(1, size=(64, 64))
-    dnerf.write_scene(tmp_path / "toy", written, camera_angle_x=0.7)
-    scene = dnerf.read_scene(tmp_path, "toy")
+    if read == "dnerf":
+        dnerf.write_scene(tmp_path / "toy", written, camera_angle_x=0.7)
+    else:
+        views = zip(posed_cameras(8, (64, 64)), ["train", "test"] * 4)
+        shots = [
+            posed_video.PosedShot(f"{i}.png", view, ball(parts[split]), split=split)
+            for i, (view, split) in enumerate(views)
+        ]
+        posed_video.write_scene(tmp_path / "toy", shots)
+    scene = {"dnerf": dnerf, "video": posed_video}[read].read_scene(tmp_path, "toy")
     (line,) = [line for line in scene.protocol["assumed"] if "multiplied" in line]
     assert f"colours of {'train' if in_training else 'test'} images, unlike those of the others, are" in line
     for part in (scene.train, scene.test):

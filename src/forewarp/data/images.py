@@ -313,18 +313,22 @@ def alpha_of(
     one_of(alpha, "data.alpha", "straight", "premultiplied", None)
     if alpha is not None:
         return dict.fromkeys(parts, alpha == "premultiplied"), []
-    told = {
-        part: is_premultiplied(read_image(paths[i]) for i in spread(len(paths), _EDGES_OF)) if paths else None
-        for part, paths in parts.items()
+    chosen = {
+        part: [paths[i] for i in spread(len(paths), _EDGES_OF)] for part, paths in parts.items() if paths
     }
+    told = {part: is_premultiplied(map(read_image, paths)) for part, paths in chosen.items()}
+    if chosen and {*told.values()} == {None}:  # together they may
+        told = dict.fromkeys(
+            told, is_premultiplied(read_image(p) for paths in chosen.values() for p in paths)
+        )
     first = next((is_so for is_so in told.values() if is_so is not None), False)
     told = {part: first if is_so is None else is_so for part, is_so in told.items()}
     if not any(told.values()):
-        return told, []
+        return dict.fromkeys(parts, False), []
     some = ", ".join(part for part, is_so in told.items() if is_so)
     which = "colours" if all(told.values()) else f"colours of {some} images, unlike those of the others,"
     line = f"{where}: {which} are taken as multiplied by alpha, as no edge is brighter than its alpha"
-    return told, [f"{line}; if they are not, set data.alpha=straight"]
+    return {**dict.fromkeys(parts, first), **told}, [f"{line}; if they are not, set data.alpha=straight"]
 
 
 def composited(rgba: Tensor, background: Tensor) -> Tensor:

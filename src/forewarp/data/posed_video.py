@@ -203,11 +203,6 @@ def read_scene(
             raise mismatch(f"{file}: {key}", f"the unit that {_UNIT} says, {units[_UNIT]}", unit, advice)
         depth_scale = number_or_none(unit, f"{file}: {key}", 1 / MOST_UNITS)
     assumed += unread_beside(file, content, [entry.path for entry in entries], beside)
-    cut_out = [entry.load for entry in entries if entry.is_cut_out]
-    premultiplied, told = alpha_of(alpha, {"all": [load.path for load in cut_out]}, file)
-    assumed += told
-    for load in cut_out:  # none is decoded yet
-        load.premultiplied = premultiplied["all"]
     names = [entry.name for entry in entries]
     cameras = [entry.camera for entry in entries]
     times, told = times_of(names, [entry.time for entry in entries], str(file), name_pattern, cameras)
@@ -225,6 +220,13 @@ def read_scene(
     parts, how = {"train": entries, "val": [], "test": []}, "cameras and moments held out by name"
     if not by_name:
         parts, how = _split_entries(file, content, entries, test_every, absent)
+    cut_out = {split: [e.load for e in part if e.is_cut_out] for split, part in parts.items()}
+    paths = {split: [load.path for load in loads] for split, loads in cut_out.items()}
+    premultiplied, multiplied = alpha_of(alpha, paths, file)
+    assumed += multiplied
+    for split, loads in cut_out.items():
+        for load in loads:  # none is decoded yet
+            load.premultiplied = premultiplied[split]
     if parts["val"] and parts["val"] == parts["test"]:
         assumed.append(f"{file}: val_filenames equals test_filenames: validation is on the test frames")
     of_splits = {split: {e.name: given[e.name] for e in part} for split, part in parts.items()}
