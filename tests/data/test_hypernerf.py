@@ -479,3 +479,13 @@ def test_evidence_elsewhere_and_cameras_counted_apart_are_told(tmp_path):
         )
         lines = [line for line in remarks(read_scene(tmp_path, "rig")) if "films from" in line]
         assert [line.partition(";")[0] for line in lines] == said
+
+
+def test_a_range_of_the_unscaled_world_is_named(tmp_path):
+    folder = write_rig(tmp_path / "toy", rig(size=(12, 8)))
+    poses = [frame.camera.camera_to_world[:3, 3] for frame in read_scene(tmp_path, "toy").train]
+    away = max(float(place.norm()) for place in poses)
+    for far, is_named in ((2 * away, False), (2 * away / SCALE, True)):
+        edit(folder / "scene.json", {"near": 0.1 * far, "far": far})
+        told = "".join(read_scene(tmp_path, "toy").protocol.get("assumed", []))
+        assert (f"as if it were not multiplied by scale; if so, write {0.1 * SCALE * far:.4g}" in told) == is_named

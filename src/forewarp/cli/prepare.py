@@ -224,7 +224,9 @@ def refuse_other_methods(config: DictConfig) -> None:
     target, model = str(config.model.get("_target_")), config.model.name
     if not (HydraConfig.initialized() and target.startswith((VOXELS, PARTICLES))):
         return
-    voxels = target.startswith(VOXELS)
+    voxels, begins = target.startswith(VOXELS), HydraConfig.get().runtime.choices.get("start_motion")
+    if begins not in (None, "null") and model != "forward":
+        raise ValueError(of_another(f"start_motion={begins}", model, "forward"))
     for group, option in HydraConfig.get().runtime.choices.items():
         own = group.startswith("model/") and "@" not in group  # else of a stage's own model
         part = config.model._get_node(group[6:]) if own else None

@@ -41,7 +41,7 @@ from forewarp.data.cameras import (
     pose_of,
 )
 from forewarp.data.depth import METRIC, SensedDepth, depths_beside, doubt_depths, unit_of
-from forewarp.data.directions import by_translation, opposite, other_readings, transposed
+from forewarp.data.directions import by_translation, common_point, opposite, other_readings, transposed
 from forewarp.data.files import (
     Entry,
     SceneError,
@@ -81,6 +81,7 @@ from forewarp.scene.frame import Frame, Scene, Truth, middle_of
 
 _SCALES, _ASPECTS = (1e-6, 1e6), (1e-2, 1e2)
 _MOST_PIXELS, _MOST_PIXELS_OFF, _MOST_BENT = 1e5, 1e7, 1e3  # beyond them a camera file is wrong
+_REACH = 5.0  # times the distance of what cameras look at: a far beyond it is likely of another unit
 _OUTSIDE = 0.1  # share of keypoints outside the images, from which on they are of others
 _MOST_MOMENTS, _RATES = 1e9, (1e-3, 1e5)
 _INTERPOLATION = "interpolation"
@@ -269,6 +270,8 @@ def read_scene(
         place = [round(value, 1) for value in torch.stack(poses)[:, :3, 3].mean(0).tolist()]
         got = f"{center}, with cameras around {place}, too far from it for single precision"
         raise mismatch(world.where("center"), "the middle of what is filmed", got, "write that")
+    if (line := _doubt_range(poses, size, near, far)) is not None:
+        assumed.append(f"{world.file}: near, far: {line}")
     if ways := other_readings(poses, _READINGS):
         line = "cameras do not look at one thing, as all of them do if"
         assumed.append(f"{folder / 'camera'}: {line} {', or if '.join(ways)}; if so, write them anew")
@@ -476,6 +479,17 @@ def _read_keypoints(path: Path) -> Tensor:
     points[:, 2] = (points[:, 2] > 0).float()
     points[:, :2] += 0.5 * points[:, 2:]
     return points
+
+
+def _doubt_range(poses: Sequence[Tensor], scale: float, near: float, far: float) -> str | None:
+    """Doubt a range that is too far in the normalised world, and would do in the unscaled one of the cameras."""
+    if (aim := common_point(poses)) is None:
+        return None
+    away = max(float((pose[:3, 3].double() - aim).norm()) for pose in poses)
+    if not (far > _REACH * scale * away and away < far < _REACH * away):
+        return None
+    line = f"far is {far / (scale * away):.2g} times the distance of what all cameras look at"
+    return f"{line}, as if it were not multiplied by scale; if so, write {scale * near:.4g} and {scale * far:.4g}"
 
 
 def _doubt_evidence(folder: Path, scale: int, train: Sequence[Frame], test: Sequence[Frame]) -> list[str]:
