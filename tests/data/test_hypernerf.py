@@ -488,4 +488,5 @@ def test_a_range_of_the_unscaled_world_is_named(tmp_path):
     for far, is_named in ((2 * away, False), (2 * away / SCALE, True)):
         edit(folder / "scene.json", {"near": 0.1 * far, "far": far})
         told = "".join(read_scene(tmp_path, "toy").protocol.get("assumed", []))
-        assert (f"as if it were not multiplied by scale; if so, write {0.1 * SCALE * far:.4g}" in told) == is_named
+        line = f"as if it were not multiplied by scale; if so, write {0.1 * SCALE * far:.4g}"
+        assert (line in told) == is_named

@@ -482,14 +482,15 @@ def _read_keypoints(path: Path) -> Tensor:
 
 
 def _doubt_range(poses: Sequence[Tensor], scale: float, near: float, far: float) -> str | None:
-    """Doubt a range that is too far in the normalised world, and would do in the unscaled one of the cameras."""
+    """Doubt a range that is too far in the normalised world, and would do in the unscaled one."""
     if (aim := common_point(poses)) is None:
         return None
     away = max(float((pose[:3, 3].double() - aim).norm()) for pose in poses)
     if not (far > _REACH * scale * away and away < far < _REACH * away):
         return None
     line = f"far is {far / (scale * away):.2g} times the distance of what all cameras look at"
-    return f"{line}, as if it were not multiplied by scale; if so, write {scale * near:.4g} and {scale * far:.4g}"
+    line += ", as if it were not multiplied by scale"
+    return f"{line}; if so, write {scale * near:.4g} and {scale * far:.4g}"
 
 
 def _doubt_evidence(folder: Path, scale: int, train: Sequence[Frame], test: Sequence[Frame]) -> list[str]:
