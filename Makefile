@@ -49,11 +49,11 @@ demo-lego-complete demo-hypernerf demo-nhr:
 	$(BIN)/forewarp-render run=runs/$@ path=both
 
 WORKERS ?= logical
-PYTEST = $(BIN)/pytest --no-cov -n $(WORKERS) --maxprocesses 4 --dist loadfile
+PYTEST = pytest --no-cov -n $(WORKERS) --maxprocesses 4 --dist loadfile
 test: ## run the tests except the slow ones, on every core up to four [WORKERS=0: in one process]
-	$(PYTEST) -m "not slow"
+	$(BIN)/$(PYTEST) -m "not slow"
 test-slow: ## run the slow tests: the page in a browser, killed runs, every method on every dataset, every sweep's jobs, the wheel
-	$(PYTEST) -m slow
+	$(BIN)/$(PYTEST) -m slow
 test-stability: ## run the numerical hard cases and killed runs, slow ones too
 	$(BIN)/pytest --no-cov -m stability tests/stability
 FLOORS := .venv-floors
@@ -62,7 +62,7 @@ test-floors: ## run the same tests with the lowest versions that pyproject.toml 
 	$(FLOORS)/bin/pip install --quiet uv
 	$(LINKS); VIRTUAL_ENV="$$PWD/$(FLOORS)" $(FLOORS)/bin/uv pip install --resolution lowest-direct \
 		-e '.[cpu,synth,plots,viewer,export,usd,capture,dev]'
-	$(FLOORS)/bin/pytest --no-cov -W default -m "not slow" # they warn of what came later
+	$(FLOORS)/bin/$(PYTEST) -W default -m "not slow" # they warn of what came later
 fuzz: ## read 5,000 harmed files of every format, the same each time: none may take 10 s of the processor, a gigabyte, or a traceback
 	OMP_NUM_THREADS=1 $(BIN)/pytest --no-cov -q -s tests/stability/test_fuzzing.py --hypothesis-profile=fuzz
 conformance: ## test every method against the contract, slow cases too, and write docs/results/conformance.md
