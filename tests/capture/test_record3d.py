@@ -104,7 +104,7 @@ def test_frames_may_be_fewer_and_have_times_and_lenses_of_their_own(tmp_path):
         ({"poses": [[0.0] * 6] * 9}, r"metadata: poses\[0\]: expected 7 numbers, but got"),
         ({"K": [0.0] * 9}, "metadata: focal length of frame 0: expected above 0, but got 0"),
         ({"K": [1.0]}, r"metadata: K: expected 9 numbers, but got \[1.0\]"),
-        ({"dw": None}, "metadata: dw: expected a number"),
+        ({"dw": None}, "metadata: dw: expected the width and height"),
         ({"dw": 10**5}, r"metadata: dw: expected a number in \[1, 2048\], but got 100000"),
         ({"rgbd/4.depth": bytes(5000)}, "rgbd/4.depth: expected at most 4528 bytes, but got 5000"),
         ({"frameTimestamps": [1.0]}, "frameTimestamps: expected 9 numbers, but got"),

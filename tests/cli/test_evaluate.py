@@ -31,6 +31,12 @@ def test_images_from_elsewhere_are_a_row_of_every_report(fitted, ok, refused, in
     assert "expected an empty folder, or images of other" in other
 
 
+def test_a_folder_of_other_files_is_not_written_into(fitted, refused):
+    scene = "data=dnerf", f"data.root={fitted.parent / 'scenes'}", "data.scene=vehicle"
+    words = f"renders={fitted / 'images'}", "name=a", *scene, f"run={fitted.parent / 'scenes' / 'vehicle'}"
+    assert "expected an empty folder, or images of a" in refused("evaluate", *words)
+
+
 def test_what_images_from_elsewhere_lack_is_named(fitted, refused):
     assert refused("evaluate", f"renders={fitted / 'images'}").startswith("name: expected what tables call")
     assert refused("evaluate", "renders=here", "name=a").startswith("data: expected the scene")

@@ -481,6 +481,14 @@ def test_evidence_elsewhere_and_cameras_counted_apart_are_told(tmp_path):
         assert [line.partition(";")[0] for line in lines] == said
 
 
+def test_points_that_are_normalised_already_are_named(tmp_path):
+    points = np.random.default_rng(0).normal(CENTER, 2.0, (50, 3))
+    for cloud, is_named in ((points, False), (normalised(points).numpy(), True)):
+        write_rig(tmp_path / "toy", rig(size=(12, 8)), points=cloud)
+        told = "".join(read_scene(tmp_path, "toy").protocol.get("assumed", []))
+        assert ("points lie where the cameras look if they are normalised already" in told) == is_named
+
+
 def test_a_range_of_the_unscaled_world_is_named(tmp_path):
     folder = write_rig(tmp_path / "toy", rig(size=(12, 8)))
     poses = [frame.camera.camera_to_world[:3, 3] for frame in read_scene(tmp_path, "toy").train]

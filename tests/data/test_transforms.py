@@ -312,6 +312,8 @@ def test_times_in_two_units_are_refused(train, test, said):
         ([0, 0.4, 0.8, 1], [1.1, 1.2]),  # seconds
         ([i / 30 for i in range(32)], [32 / 30]),
         (range(-1, 99), [50]),
+        ([*(i / 25 for i in range(26)), 1.2, 1.24], [0.5]),  # a pause
+        ([-0.5, *(i / 10 for i in range(30))], [0.5]),
     ],
 )
 def test_times_in_one_unit_are_not_refused(train, test):
@@ -324,12 +326,13 @@ def test_times_in_one_unit_are_not_refused(train, test):
     [
         ([*range(9), 0, *range(10, 20)], "time 0 of f/0009 is out of the order of the images' names; mend"),
         ([*range(9), -1, *range(10, 20)], "time -1 of f/0009 is out of the order"),
-        ([0, 0.1, 0.2, 33.0, 0.4, 0.5, 0.6], "time 33 of f/0003 is out of the order"),
+        ([0, 0.1, 0.2, 33.0, 0.4, 0.5, 0.6, 0.7], "time 33 of f/0003 is out of the order"),
         ([0.0] * 19 + [1.0], r"19 of 20 images have one time, 0 \(f/0000, f/0001, ..\); mend it"),
         ([*range(9), 8, *range(10, 20)], r"2 of 20 images have one time, 8 \(f/0008, f/0009, ..\); mend it"),
         ([*range(10), *range(10)], None),
         ([i // 2 for i in range(20)], None),
         ([*range(20)][::-1], None),
+        ([3, 0, 2, 1], None),  # in no order
     ],
 )
 def test_an_odd_time_among_those_of_a_film_is_said(times, said):
@@ -528,7 +531,7 @@ def test_poses_written_in_another_way_are_refused_with_the_mend(matrix, said):
             {"frames.0.fov": 60},
             "frames: fov: not read, which seems to be of the camera; call a focal length in",
         ),
-        ({"white_transparent": True}, "white_transparent: not read: images show their background; cut the"),
+        ({"white_transparent": True}, "white_transparent: not read; where images show their background, cut"),
         ({"white_transparent": False, "cameras": [{"id": 0, "place": [0, 0, 0]}]}, None),
         (
             {"test_frames": [{"file_path": "a.png"}]},

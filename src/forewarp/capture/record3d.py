@@ -117,6 +117,12 @@ class _Scan:
         self.about = Entry(path, about, "metadata: ")
         width, height = (int(self.about.number(key, 1, _MOST_SIDE)) for key in ("w", "h"))
         self.size = width, height
+        if lacking := [key for key in ("dw", "dh") if about.get(key) is None]:
+            expected, advice = (
+                "the width and height of depth",
+                "add them: 192 and 256 of a LiDAR's upright scans",
+            )
+            raise mismatch(self.about.where(", ".join(lacking)), expected, "none", advice)
         width, height = (int(self.about.number(key, 1, _MOST_DEPTH_SIDE)) for key in ("dw", "dh"))
         self.of_depth = width, height
         if abs(height * self.size[0] - width * self.size[1]) > max(width, height, *self.size):

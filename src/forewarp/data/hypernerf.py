@@ -24,6 +24,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from reprlib import repr as short
+from statistics import median
 
 import numpy as np
 import torch
@@ -82,6 +83,7 @@ from forewarp.scene.frame import Frame, Scene, Truth, middle_of
 _SCALES, _ASPECTS = (1e-6, 1e6), (1e-2, 1e2)
 _MOST_PIXELS, _MOST_PIXELS_OFF, _MOST_BENT = 1e5, 1e7, 1e3  # beyond them a camera file is wrong
 _REACH = 5.0  # times the distance of what cameras look at: a far beyond it is likely of another unit
+_SPECK, _ROOM = 0.15, 4.0  # of the distance of what cameras look at, between which points of a scene spread
 _OUTSIDE = 0.1  # share of keypoints outside the images, from which on they are of others
 _MOST_MOMENTS, _RATES = 1e9, (1e-3, 1e5)
 _INTERPOLATION = "interpolation"
@@ -290,7 +292,11 @@ def read_scene(
     }
     bounds = box_of(box) or frustum_box(f.camera for f in train)
     truth = read_truth(folder / "trajectories.npz", canonical, normalised)
-    still = normalised.to_scene(read_cloud(points, 3)).float() if points.exists() else None
+    cloud = read_cloud(points, 3) if points.exists() else None
+    if cloud is not None and _are_normalised(cloud, poses, normalised):
+        line = "points lie where the cameras look if they are normalised already, and else do not"
+        protocol["assumed"] = [*assumed, f"{points}: {line}; if so, write them as unscaled world coordinates"]
+    still = None if cloud is None else normalised.to_scene(cloud).float()
     return Scene(scene, train, (), test, bounds, canonical, False, truth, protocol, still, world=normalised)
 
 
@@ -491,6 +497,23 @@ def _doubt_range(poses: Sequence[Tensor], scale: float, near: float, far: float)
     line = f"far is {far / (scale * away):.2g} times the distance of what all cameras look at"
     line += ", as if it were not multiplied by scale"
     return f"{line}; if so, write {scale * near:.4g} and {scale * far:.4g}"
+
+
+def _are_normalised(points: np.ndarray, poses: Sequence[Tensor], world: Normalisation) -> bool:
+    """Tell whether points (N, 3) of the unscaled world seem to be normalised: then they lie around what
+    cameras look at, within their distance from it, and else they do not, or in a speck.
+    """
+    if (aim := common_point(poses)) is None or not len(points):
+        return False
+    away = median(float((pose[:3, 3].double() - aim).norm()) for pose in poses)
+    middle = np.median(points, 0)
+    spread = float(np.median(np.linalg.norm(points - middle, axis=-1)))
+
+    def fits(target: Tensor, unit: float) -> bool:
+        distance = float(np.linalg.norm(middle - np.asarray(target))) / (unit * away)
+        return distance < 1 and _SPECK < spread / (unit * away) < _ROOM
+
+    return fits(world.to_scene(aim), world.scale) and not fits(aim, 1.0)
 
 
 def _doubt_evidence(folder: Path, scale: int, train: Sequence[Frame], test: Sequence[Frame]) -> list[str]:

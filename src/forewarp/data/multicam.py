@@ -415,6 +415,12 @@ def _moments(tracks: Sequence[_Track], most: int | None, folder: Path) -> tuple[
             if mine[at] != numbers[0][at]:
                 expected = f"a frame of the number of {folders[0].path.name}/{folders[0].images[at].name}"
                 advice = "remove a frame that one camera lacks from all"
+                shifts = {a[-1] - b[-1] for a, b in zip(mine, numbers[0]) if a and b}
+                if len(shifts) == 1:  # only who filmed knows whether it began later
+                    other = (
+                        f"if only its count begins at another number, rename its frames by {-shifts.pop():+d}"
+                    )
+                    advice = f"{other}; else {advice}"
                 raise mismatch(track.path, expected, track.images[at].name, advice)
     return count, assumed
 

@@ -70,7 +70,7 @@ _SAME_TIMES = 0.25  # of the shortest step, by which times of two readings may d
 _RATES = (24, 25, 30, 50, 60)  # frames a second of time codes
 _SHORT = 0.25  # of the time since a clock began, that a film lasts at most
 _CALENDAR = ("year", "month", "day", "hour", "minute", "second")  # groups of a pattern
-_LEAST_STEPS = 5  # which are even by no chance
+_LEAST_STEPS, _FEW_STEPS = 5, 3  # which are even by no chance; of plain counters, the most usual names
 _MOST_DIGITS = 40  # of a time with its fraction
 _SKIPPED = 4  # numbers at most that time codes leave out at the beginning of a minute
 _CARRY = 3.0  # steps of the last number from its end and its beginning within which it is carried over
@@ -432,7 +432,8 @@ def _composed(names: Sequence[str], where: str) -> Sequence[str]:
     """
     found: dict[tuple[int, int], dict[str, tuple]] = {}
     for what, pattern, read in _FORMS:
-        matches = [[*pattern.finditer(name)] for name in (names if pattern.search(names[0]) else ())]
+        some = names if pattern.search(names[0]) else ()  # none within a number that is marked
+        matches = [[m for m in pattern.finditer(n) if n.count("\0", 0, m.start()) % 2 == 0] for n in some]
         for column in zip(*matches) if len({*map(len, matches)}) == 1 else ():
             values = [*map(read, column)]
             is_few = len({*values}) < min(_FEW, len(names))  # as of cameras
@@ -451,6 +452,10 @@ def _composed(names: Sequence[str], where: str) -> Sequence[str]:
     no_seconds = part.get("H") and not part["S"] and not part["half"]
     may_count = no_seconds or (column[0][0].isdigit() and not part.get("Y"))
     is_small = column[0][0].isdigit() and max(counts) < 10 ** (len(column[0][0]) - 2)
+    parts = [match.groupdict() for match in column]
+    is_one_day = len({tuple(each.get(key) for key in "Yymd") for each in parts}) == 1
+    if part.get("d") and is_one_day and not part.get("f") and any(each.get("H") == "00" for each in parts):
+        readings[_COUNTER] = counts  # behind a date
     if may_count and (len(names) < _FEW or is_small or _unevenness(counts) < _ROUNDING):
         readings[_COUNTER] = counts
     if np.ptp(readings.get(_TIME_OF_DAY, 0)) > 12 * 3600 and _unevenness(counts) >= _ROUNDING:
@@ -473,7 +478,8 @@ def _survivor(readings: Mapping[str, Sequence[float]], name: str, where: str) ->
     ranked = sorted(readings, key=lambda what: _unevenness(readings[what]))
     best = _unevenness(readings[ranked[0]])
     rest = [what for what in ranked[1:] if not _agree(readings[ranked[0]], readings[what])]
-    tells = best <= _EVEN and len({*readings[ranked[0]]}) > _LEAST_STEPS
+    least = _FEW_STEPS if ranked[0] == _COUNTER else _LEAST_STEPS
+    tells = best <= _EVEN and len({*readings[ranked[0]]}) > least
     if tells and all(_unevenness(readings[what]) > _UNEVEN * best + 0.05 for what in rest):
         return ranked[0]
     raise _two_ways(where, name, ", or ".join((first, *differ)))

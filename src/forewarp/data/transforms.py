@@ -82,7 +82,7 @@ _OWN_NUMBERS = 0.5  # share of training's span that frames of an own numbering l
 _LEAST_UNIT = 0.5  # of all times, that those in [0, 1] span
 _ROUNDING = 1e-6  # beyond 0 and 1
 _FEW = 0.1  # share of the frames, one at least, whose times are in doubt where those of all others agree
-_LEAST_FRAMES = 4  # from which on their order tells
+_LEAST_FRAMES = 8  # from which on their order tells
 _APART = 3.0  # longest steps of all other times, by which one is far from them
 
 
@@ -203,7 +203,8 @@ def unread_beside(
         return any(each not in (None, False, 0, "") for each in values)
 
     like = [key for key in like if any(is_said(entry.get(key)) for entry in entries)]
-    if key := _cameras_elsewhere(content):
+    has_own = any({"fl_x", "camera_angle_x"} & {*entry.own} for entry in entries)
+    if (key := _cameras_elsewhere(content)) and not has_own:
         advice = "write fl_x, fl_y, cx, cy and the lens of its camera into each frame"
         lines.append(f"{file}: {key}: not read, which seems to be of each camera; {advice}")
     own = dict.fromkeys(key for entry in entries for key in entry.own if key not in _FOCAL)
@@ -214,7 +215,7 @@ def unread_beside(
     cut = [key for key in keys if _CUT_OUT.fullmatch(key) and any(is_said(e.get(key)) for e in entries)]
     if cut:
         advice = "cut the subject out by alpha, or name masks by mask_path and set data.masks=alpha"
-        lines.append(f"{file}: {cut[0]}: not read: images show their background; {advice}")
+        lines.append(f"{file}: {cut[0]}: not read; where images show their background, {advice}")
     lines += _unread_splits(file, content, entries)
     if "depth_file_path" in entries[0].common:
         lines.append(f"{file}: depth_file_path at the top is not read; write that of each frame into it")
@@ -629,7 +630,8 @@ def _odd_time(names: Sequence[str], times: Sequence[float]) -> str:
             continue
         order = sorted(range(len(rows)), key=lambda k: (read.frames[k], times[rows[k]]))
         rows = [rows[k] for k in order]
-        odd = sorted({*rows} - {*_longest_ascent(rows, times)}, key=rows.index)
+        ascent = {*_longest_ascent(rows, times)}
+        odd = [row for row in rows if row not in ascent]
         if 0 < len(odd) <= most:
             said = f"time {times[odd[0]]:.10g} of {names[odd[0]]} is out of the order of the images' names"
             return f"{said}; mend it, if it is wrong"
@@ -697,7 +699,8 @@ def check_times(
         name = max(odd, key=away.get, default="")
         stand_for_none = len({named[name] for name in odd}) == 1 and named[odd[0]] < 0
         are_few = 0 < len(odd) <= max(1, _FEW * len(named)) or stand_for_none
-        if are_few and away[name] > _APART * np.diff(rest).max():
+        is_far = are_few and away[name] > _APART * np.diff(rest).max()
+        if is_far and (away[name] >= rest[-1] - rest[0] or named[name] == -1):  # else a pause
             expected = f"a time near all others, {rest[0]:.10g} to {rest[-1]:.10g}"
             raise mismatch(f"{where}: time of {name}", expected, f"{named[name]:.10g}", advice)
     for split, of in splits.items():

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 ABOUT = "about.json"  # in every folder of an export, which may then be replaced
 _AXES = "the data's own world, right-handed, in its own unit of length; turned about its origin if up says so"
-_SHIFTED = "; its coordinates are those of the files, turned back, and shift"
+_SHIFTED = "; data = files, turned back by rotation, plus shift"
 
 
 class Format(NamedTuple):

@@ -305,6 +305,8 @@ def stage_of(name: str, config: DictConfig) -> StagePlan:
         got = f"only {', '.join(content)}, which is of another method's; leave out what sets it"
         raise ValueError(f"stage.{name}: expected a stage of the method, but got {got}")
     plan = instantiate(content, _convert_="all")
+    if not isinstance(plan, StagePlan):
+        raise mismatch(f"stage.{name}", "a stage (StagePlan)", type(plan).__name__, "mend its _target_")
     plan.model = None if own is None else model_of(OmegaConf.create(own))
     return plan
 

@@ -86,13 +86,15 @@ def measure_elsewhere(config: DictConfig) -> dict:
 
 
 def _refuse_another(folder: Path, name: str) -> None:
-    """Refuse a folder that holds a run of ours or another method's images."""
+    """Refuse a folder that holds anything but images of this method, measured before."""
     refuse_links(folder)
-    if not (path := folder / "config.yaml").is_file():
+    files = [path for path in folder.iterdir() if path.name[0] != "."] if folder.is_dir() else []
+    if not files:
         return
-    other = load_yaml(path)
-    if other.get("renders") is None or other.get("model") != {"name": name}:
-        raise mismatch(folder, f"an empty folder, or images of {name}", "another run", "set run=FOLDER")
+    other = load_yaml(folder / "config.yaml") if (folder / "config.yaml").is_file() else None
+    if not isinstance(other, dict) or other.get("renders") is None or other.get("model") != {"name": name}:
+        expected, got = f"an empty folder, or images of {name}", "one with other files"
+        raise mismatch(f"run: {folder}", expected, got, "set run=FOLDER")
 
 
 def files_of(folder: Path, names: Sequence[str]) -> list[Path]:
