@@ -224,7 +224,7 @@ def test_cameras_beside_each_other_that_move_on_are_a_rig():
         ([f"20231104_10111{s}_{f}" for s, f in ((2, 345), (3, 410), (4, 777))], "fractions of the seconds"),
         ([f"010059{f:02d}" for f in (1, 7, 20)] + ["01010001", "01010019"], "codes of 24 frames"),
         ([f"f{i:06d}" for i in (3, 17, 48, 101, 122, 157)], "times of day, or a counter"),
-        ([f"2024-05-01_{i:04d}" for i in (3, 20, 45, 101, 140, 212)], "that begin with the year, or a counter"),
+        ([f"2024-05-01_{i:04d}" for i in (3, 20, 45, 101, 140, 212)], "with the year, or a counter"),
         ([f"{i:012d}_{i * 3:09d}" for i in range(10)], "names that tell times in one way"),
         ([f"{i % 65536:05d}" for i in range(65530, 65540)], "to 65535, where a counter began anew"),
         (["23-59-58", "23-59-59", "00-00-01", "00-00-02"], "names that tell times in one way"),
