@@ -30,6 +30,9 @@ def load(run, *, trust=(), device="cpu", data_root=None):
         ValueError: where there is no finished run, where it names code that is not trusted, or where a file
             is none of ours.
     """
+    from forewarp.provenance import drop_missing_backend
+
+    drop_missing_backend()  # before what imports matplotlib
     from forewarp.runs.fitted import open_run
 
     return open_run(run, trust=trust, device=device, data_root=data_root)

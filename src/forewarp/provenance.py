@@ -31,6 +31,15 @@ def import_nothing_from_here() -> None:
     sys.path[:] = [place for place in sys.path if place]
 
 
+def drop_missing_backend() -> None:
+    """Let matplotlib draw where ``MPLBACKEND`` names a module that is not installed here, as a notebook hands
+    its own on to commands.
+    """
+    scheme, _, module = os.environ.get("MPLBACKEND", "").partition("module://")
+    if not scheme and module and find_spec(module.partition(".")[0]) is None:
+        os.environ["MPLBACKEND"] = "agg"
+
+
 @cache
 def source_of(package: str) -> dict[str, str]:
     """Return ``version`` and ``commit`` of a top-level package or module, each where it is known.

@@ -24,6 +24,7 @@ from omegaconf.errors import ConfigKeyError
 from forewarp.cli import entry
 from forewarp.cli.mistakes import one_line, unknown_key, with_keys
 from forewarp.data.files import SceneError
+from forewarp.provenance import drop_missing_backend
 from forewarp.runs.overrides import next_command
 from forewarp.runs.session import claim
 from tests.support.configs import CONF, ROOT, options
@@ -85,6 +86,20 @@ def test_variables_of_launchers_decide_nothing(monkeypatch):
     left = [name for name in os.environ if name.startswith("PL_TRAINER") or name in ("RANK", "LOCAL_RANK")]
     assert left == []
     assert os.environ["SLURM_PROCID"] == "2"  # launchers of sweeps need it; ``SingleProcess`` is of rank 0
+
+
+@pytest.mark.parametrize(
+    ("named", "left"),
+    [
+        ("module://not_there.inline", "agg"),
+        ("module://json.decoder", "module://json.decoder"),
+        ("svg", "svg"),
+    ],
+)
+def test_a_notebooks_backend_that_is_not_installed_is_dropped(monkeypatch, named, left):
+    monkeypatch.setenv("MPLBACKEND", named)
+    drop_missing_backend()
+    assert os.environ["MPLBACKEND"] == left
 
 
 def test_missing_conf_is_named(refused, monkeypatch, in_tmp):

@@ -353,6 +353,21 @@ def test_one_camera_is_tested_on_moments_alone(tmp_path):
     assert len(read_scene(tmp_path, "toy", test_moments=[1]).train) == 3
 
 
+def test_rows_without_the_turn_of_llff_are_named(tmp_path):
+    cameras = fixed_cameras(6)
+    for k in range(6):
+        write_image(tmp_path / "toy" / f"cam{k:02d}" / "0000.png", grey(cameras[k], 0, k))
+    for turned in (False, True):
+        write_poses(tmp_path / "toy", cameras, near=14.0, far=30.0)
+        if turned:  # right, up, backwards
+            table = np.load(tmp_path / "toy" / FILE)
+            blocks = table[:, :15].reshape(-1, 3, 5)
+            blocks[..., :2] = np.stack([blocks[..., 1], -blocks[..., 0]], -1)
+            np.save(tmp_path / "toy" / FILE, table)
+        told = "".join(read_scene(tmp_path, "toy").protocol.get("assumed") or [])
+        assert ("turned by a quarter about their axes" in told) == turned
+
+
 def test_films_of_other_names_are_said_or_refused(folder):
     (folder / "cam02").rename(folder / "left")
     with refused("a row for each of 2 cameras, cam00, cam01, but got 3 rows, as if left were cameras, too"):

@@ -205,7 +205,7 @@ class _Scan:
         """Return the bytes of a file in the archive, at most ``most``."""
         where = f"{self.path}: {name}"
         if name not in self.archive.NameToInfo:
-            raise mismatch(where, "this file in the archive", "none")
+            raise mismatch(where, "this file in the archive", "none", "export the scan with depth once more")
         if (size := self.archive.getinfo(name).file_size) > most:
             raise mismatch(where, f"at most {most} bytes", size)
         try:

@@ -123,7 +123,9 @@ def check(config) -> tuple[dict, object]:
         what, there = ("file", Path.is_file) if key == "video" else ("folder", Path.is_dir)
         if path is not None and not there(path):
             got = "another thing" if path.exists() else "none"
-            raise ValueError(f"{key}: expected an existing {what}, but got {got}: {path}; set {key}=...")
+            of_images = key == "video" and (path.is_dir() or "%" in path.name or "*" in path.name)
+            advice = f"images={path if path.is_dir() else path.parent}" if of_images else f"{key}=..."
+            raise ValueError(f"{key}: expected an existing {what}, but got {got}: {path}; set {advice}")
     for key, least in (("frames", 3), ("size", 64), ("features", 100)):
         if config[key] is not None or key == "features":
             whole(config[key], key, least)

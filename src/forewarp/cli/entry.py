@@ -21,7 +21,7 @@ import forewarp
 from forewarp.cli.mistakes import flat, one_line, options_last, refuse_dashes, unknown_key, with_keys
 from forewarp.interrupts import listening, signal_of
 from forewarp.progress import printable_output
-from forewarp.provenance import import_nothing_from_here
+from forewarp.provenance import drop_missing_backend, import_nothing_from_here
 from forewarp.runs import overrides
 from forewarp.runs.config_files import configurations, installed, project_root
 from forewarp.runs.overrides import as_text, command_of_job, is_sweep, key_of
@@ -132,6 +132,7 @@ def quiet() -> None:
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # Ray would report usage to its makers
     drop_launchers()
     import_nothing_from_here()
+    drop_missing_backend()
     # Lets Hydra raise errors instead of printing them.
     os.environ["HYDRA_FULL_ERROR"] = "1"
     logging.disable(logging.INFO)

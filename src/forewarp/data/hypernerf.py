@@ -206,6 +206,10 @@ def read_scene(
     def frame(item: str) -> Frame:
         path = paths[item]
         file = inside(folder / "camera", f"{item}.json", where)
+        if not file.is_file():
+            raise mismatch(
+                file, "the camera of an image", "none", "write it, or take the id out of dataset.json"
+            )
         entry = Entry(file, read_json(file))
         camera = _camera_of(entry, near, far)
         unread.update(dict.fromkeys(_unread_lens(entry, camera)))

@@ -63,6 +63,7 @@ _AGREES = 0.8  # error of the right order as a share of the other's, at most
 _EVEN = 0.1  # frames by which even times may be off
 _MOST_APART = 0.5  # frames by which two videos may run apart
 # A camera's axes down, right, backwards to OpenCV's, and back.
+_ROLLED = 0.02  # by which the mean of upward axes is shorter than that of horizontal ones
 _AXES = torch.tensor([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]], dtype=torch.float64)
 _READINGS = {  # what else may be in a row
     "they are world-to-camera": lambda poses: inverted(poses @ _AXES) @ _AXES,
@@ -309,6 +310,16 @@ def read_rows(path: Path, names: Sequence[str]) -> list[Camera]:
     return cameras
 
 
+def _rolled(cameras: Sequence[Camera]) -> bool:
+    """Tell whether cameras seem to be turned by a quarter about their axes: then their horizontal axes agree
+    better than their upward ones, and they stand above each other.
+    """
+    poses = torch.stack([camera.camera_to_world.double() for camera in cameras])
+    right, down = (poses[:, :3, column].mean(0) for column in (0, 1))
+    along = [float((poses[:, :3, 3] @ axis).std()) if len(cameras) > 1 else 0.0 for axis in (right, down)]
+    return float(right.norm() - down.norm()) > _ROLLED and along[1] > 2 * along[0]
+
+
 def ordered_rows(
     path: Path, names: Sequence[str], images: Callable[[], list[Tensor]], order: str | None, key: str
 ) -> tuple[list[Camera], list[str]]:
@@ -325,13 +336,17 @@ def ordered_rows(
     Raises:
         SceneError: as ``read_rows``, and where neighbouring views do not tell.
     """
-    cameras, texts = read_rows(path, names), sorted(names)
+    cameras, texts, lines = read_rows(path, names), sorted(names), []
+    if _rolled(cameras):
+        line = "cameras seem to be turned by a quarter about their axes, as rows without LLFF's turn are"
+        advice = "if images are upright, write [R | T] with the axes down, right, backwards"
+        lines.append(f"{path}: {line}; {advice}")
     if order == "number" or texts == list(names):
-        return cameras, []
+        return cameras, lines
     rows = dict(zip(texts, read_rows(path, texts)))
     by_text = [rows[name] for name in names]
     if order == "text":
-        return by_text, []
+        return by_text, lines
     small, errors = images(), {}
     some = spread(len(small), _COMPARED)
     for by_what, all_of in (("number", cameras), ("text", by_text)):
@@ -342,7 +357,7 @@ def ordered_rows(
         raise mismatch(path, "rows in one order", f"{orders}, and images that do not tell", key)
     best = min(errors, key=errors.get)
     line = f"rows are taken in the order of names by {best}, as neighbouring views agree so; else {key}"
-    return cameras if best == "number" else by_text, [f"{path}: {line}"]
+    return cameras if best == "number" else by_text, [*lines, f"{path}: {line}"]
 
 
 def _first_image(track: _Track) -> Tensor:
