@@ -98,6 +98,7 @@ def test_frames_may_be_fewer_and_have_times_and_lenses_of_their_own(tmp_path):
     ("changes", "message"),
     [
         ({"poses": []}, r"metadata: poses: expected a pose of each frame, but got \[\]"),
+        ({"rgbd/9.jpg": b"more"}, "metadata: poses: expected one of each of 10 images, but got 9"),
         ({"poses": None}, "metadata: poses: expected a pose of each frame, but got None"),
         ({"perFrameIntrinsicCoeffs": [[9.0] * 4]}, "perFrameIntrinsicCoeffs: expected 9 rows of 4 numbers"),
         ({"poses": [[0.0] * 7] * 9}, r"poses\[0\]: expected a quaternion of length 1, but got 0"),

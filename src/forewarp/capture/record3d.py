@@ -12,6 +12,7 @@ byte for each, ARKit's level 0, 1 or 2; both are compressed by LZFSE.
 from __future__ import annotations
 
 import json
+import re
 import zipfile
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -131,6 +132,10 @@ class _Scan:
             raise mismatch(self.about.where("dw, dh"), expected, by(self.of_depth), advice)
         self.poses, self.w_first = self._rows("poses", 7), False
         count, matrix = len(self.poses), self.about.numbers("K", 9, *_UNITS)
+        images = sum(re.fullmatch(r"rgbd/\d+\.jpg", name) is not None for name in archive.NameToInfo)
+        if images > count:
+            advice = "export the scan once more, or remove the images that have none"
+            raise mismatch(self.about.where("poses"), f"one of each of {images} images", count, advice)
         by_rows = matrix[6] == matrix[7] == 0 < min(matrix[2], matrix[5])
         self.intrinsics = [[matrix[k] for k in ((0, 4, 2, 5) if by_rows else (0, 4, 6, 7))]] * count
         if about.get("perFrameIntrinsicCoeffs"):
