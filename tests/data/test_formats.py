@@ -149,7 +149,7 @@ BAD = {
     ],
     "rig": [
         (TRUTH, {"points": TWO[None], "times": [0.25, 1]}, "begin at the canonical time 0.5"),
-        (CAMERA, None, "left1_000000.json: expected a readable file, but got No such file"),
+        (CAMERA, None, "left1_000000.json: expected the camera of an image, but got none"),
         (CAMERA, {"orientation": GONE}, "orientation: expected 3 x 3 numbers, but got None"),
         (CAMERA, {"orientation.0": [2, 0, 0]}, "orientation: expected a rotation"),
         (CAMERA, {"position": [1, 2]}, r"position: expected 3 numbers, but got \[1, 2\]"),
