@@ -297,8 +297,8 @@ def test_names_of_many_cameras_are_shortened():
 def test_frames_in_a_folder_are_compared_with_the_films_beside_it(films, tmp_path, numbers, says):
     folder = shutil.copytree(films / "toy", tmp_path / "toy")
     (folder / "cam01.mp4").unlink()
-    for number in numbers:
-        write_image(folder / "cam01" / f"{number:04d}.png", grey(CAMERAS[1], number, 1))
+    for k, number in enumerate(numbers):
+        write_image(folder / "cam01" / f"{number:04d}.png", grey(CAMERAS[1], k, 1))
     if says:
         with refused(says):
             read_scene(tmp_path, "toy")
