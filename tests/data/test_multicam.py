@@ -353,6 +353,13 @@ def test_one_camera_is_tested_on_moments_alone(tmp_path):
     assert len(read_scene(tmp_path, "toy", test_moments=[1]).train) == 3
 
 
+def test_a_camera_that_counts_from_another_number_is_named(folder):
+    for path in sorted((folder / "cam02").iterdir(), reverse=True):
+        path.rename(path.with_name(f"{int(path.stem) + 1:04d}.png"))
+    with refused("if only its count begins at another number, rename its frames by -1; else remove a frame"):
+        read_scene(folder.parent, "toy")
+
+
 def test_rows_without_the_turn_of_llff_are_named(tmp_path):
     cameras = fixed_cameras(6)
     for k in range(6):

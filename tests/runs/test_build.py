@@ -9,7 +9,7 @@ from omegaconf import OmegaConf
 
 from forewarp.cli.train import beginning
 from forewarp.runs import build
-from forewarp.runs.config import content_hash, plain
+from forewarp.runs.config import check_values, content_hash, plain
 from forewarp.runs.devices import device_for, why_on_cpu
 from tests.support.configs import composed
 
@@ -242,3 +242,14 @@ def test_a_key_of_the_data_that_is_new_and_null_changes_no_hash():
     stored = OmegaConf.create(plain(config))
     del stored.data["name_pattern"]
     assert content_hash(stored) == content_hash(config)
+
+
+def test_a_stage_of_another_class_is_refused():
+    config = {"_target_": "forewarp.training.objective.Objective", "weights": {"photo": 1.0}}
+    with pytest.raises(ValueError, match=r"stage.fine: expected a stage \(StagePlan\), but got Objective"):
+        build.stage_of("fine", OmegaConf.create(config))
+
+
+def test_data_without_a_layout_are_refused():
+    with pytest.raises(ValueError, match="data: expected a layout, but got none"):
+        check_values(OmegaConf.create({"data": {"scene": "a"}, "callbacks": {}}))

@@ -265,8 +265,9 @@ def measure_renders(
     scores = [(row["ability"], row["scores"]) for row in rows]
     test = summarise([*scores, *(part for row in rows for part in row["parts"].items())])
     about = {"scene": scene.name, **scene.protocol, **from_training(scene), **protocol, "scored": ELSEWHERE}
+    measured_by = {name: version for name, version in versions().items() if name in _MEASURED_BY}
     metrics = {
-        "protocol": about | {"versions": {name: versions()[name] for name in _MEASURED_BY}},
+        "protocol": about | {"versions": measured_by},
         "seconds": {} if minutes is None else {"train": 60 * minutes},
         "test": test,
         "metrics": described(dict.fromkeys(name for of_kind in test.values() for name in of_kind)),
