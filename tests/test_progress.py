@@ -1,4 +1,5 @@
 import io
+import os
 import sys
 
 import pytest
@@ -116,3 +117,13 @@ def test_a_terminal_that_knows_no_such_letter_gets_its_number():
     print("José \udcff", file=PrintableStream(raw))
     raw.flush()
     assert raw.buffer.getvalue() == rb"Jos\xe9 \udcff" + b"\n"
+
+
+def test_a_command_goes_on_once_the_reader_has_closed_its_output():
+    reader, writer = os.pipe()
+    os.close(reader)
+    with os.fdopen(writer, "w") as raw:
+        for _ in range(2):  # the first is dropped, and so is what follows
+            print("a line", file=PrintableStream(raw), flush=True)
+            TextConsole(PrintableStream(raw)).print("a table")
+        raw.write("a line past it")

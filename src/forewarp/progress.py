@@ -4,6 +4,7 @@ so that it cannot steer the terminal.
 
 from __future__ import annotations
 
+import os
 import re
 import sys
 import threading
@@ -30,13 +31,44 @@ def printable(text: str) -> str:
     return _STEERING.sub(lambda sign: ascii(sign[0])[1:-1], text)
 
 
+class _LastingStream:
+    """A stream that lasts: once its reader has closed it (``| head``), what follows is dropped, and the
+    command goes on.
+    """
+
+    def __init__(self, stream: TextIO) -> None:
+        self.stream = stream
+
+    def write(self, text: str) -> int:
+        """Write text; return how many characters it has."""
+        with self._kept():
+            self.stream.write(text)
+        return len(text)
+
+    def flush(self) -> None:
+        """Hand what was written to the reader."""
+        with self._kept():
+            self.stream.flush()
+
+    @contextmanager
+    def _kept(self) -> Iterator[None]:
+        try:
+            yield
+        except BrokenPipeError:
+            with open(os.devnull, "w") as nowhere:
+                os.dup2(nowhere.fileno(), self.stream.fileno())
+
+    def __getattr__(self, name: str) -> object:
+        return getattr(self.stream, name)
+
+
 class PrintableStream:
     """A stream in whose text no name of a file or scene steers the terminal; what the terminal's encoding
     lacks is written as Python does, too.
     """
 
     def __init__(self, stream: TextIO) -> None:
-        self.terminal = stream
+        self.terminal = _LastingStream(stream)
 
     def write(self, text: str) -> int:
         """Write text; return how many characters it has."""

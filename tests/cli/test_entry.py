@@ -462,3 +462,9 @@ def test_a_terminal_that_knows_ascii_only_shows_other_characters_escaped():
     environment = {**os.environ, "PYTHONIOENCODING": "ascii"}
     done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, check=True)
     assert done.stdout.strip() == rb"Gr\xf6\xdfe"
+
+
+@pytest.mark.parametrize(("encoding", "mend"), [("ascii", "PYTHONUTF8=1"), ("utf-8", "rename the file")])
+def test_a_name_that_is_decoded_in_half_says_what_to_set(refused, monkeypatch, encoding, mend):
+    monkeypatch.setattr(sys, "getfilesystemencoding", lambda: encoding)
+    assert mend in refused("train", "data=dnerf", "data.scene=T\udcc3\udca4nz")

@@ -58,7 +58,6 @@ def command(name: str, task: Callable, text: str, *, config: str | None = None) 
             sys.exit(0)
         if any(argument.partition("=")[0] in ("--info", "-i") for argument in sys.argv[1:]):
             logging.disable(logging.NOTSET)  # Hydra logs what it prints
-            logging.raiseExceptions = False  # of a reader that closed the output
         failures: list[int] = []
         words = arguments_of(name, sys.argv[1:])
         with listening():
@@ -68,9 +67,6 @@ def command(name: str, task: Callable, text: str, *, config: str | None = None) 
                     break
     except KeyboardInterrupt as interruption:
         sys.exit(interrupted(name, interruption))
-    except BrokenPipeError:  # the reader of the output closed it
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        sys.exit(0)
     except SystemExit as leaving:
         # Lightning turns Ctrl-C into its own exit.
         if isinstance(leaving.__context__, KeyboardInterrupt):
@@ -104,6 +100,7 @@ def arguments_of(name: str, typed: Sequence[str]) -> list[str]:
 
     ``dataset=NAME`` is ``experiment=NAME`` where scenes are trained on, and a group where they are written.
     """
+    _refuse_half_decoded(typed)
     arguments = as_text(with_keys(name, typed))
     if name in ("train", "plan"):
         arguments = [re.sub(r"^dataset=", "experiment=", argument) for argument in arguments]
@@ -117,6 +114,16 @@ def arguments_of(name: str, typed: Sequence[str]) -> list[str]:
 
         arguments = with_plan(name, arguments)
     return options_last(arguments)
+
+
+def _refuse_half_decoded(words: Sequence[str]) -> None:
+    """Refuse words that no file in UTF-8 can hold, which a run, its trackers and its page write."""
+    for word in words:
+        if word.encode(errors="replace").decode() == word:
+            continue
+        if (encoding := sys.getfilesystemencoding()) == "utf-8":
+            raise ValueError(f"expected words in UTF-8, but got {ascii(word)}; rename the file or folder")
+        raise ValueError(f"{ascii(word)}: Python reads names as {encoding} here; set PYTHONUTF8=1")
 
 
 def quiet() -> None:
