@@ -23,6 +23,7 @@ from PIL import Image
 
 from forewarp.capture.pipeline import PICTURE
 from forewarp.data import hypernerf
+from forewarp.data.files import Entry, read_json
 from forewarp.data.images import read_image
 from forewarp.data.posed_video import PosedShot, read_scene, write_scene
 from forewarp.drawing.images import in_a_row, to_bytes, write_video
@@ -150,7 +151,8 @@ def real(source: Path, folder: Path, steps: int, seeds: list[int]) -> dict:
         spent = called("capture", f"images={source / 'rgb' / '1x'}", f"out={found}", "threads=1")
         (folder / f"{name}.seconds").write_text(f"{spent}")
     names = sorted(path.stem for path in (source / "camera").iterdir())
-    given = [hypernerf.read_camera(source / "camera" / f"{one}.json", 0.0, 1.0) for one in names]
+    files = [source / "camera" / f"{name}.json" for name in names]
+    given = [hypernerf.camera_of(Entry(file, read_json(file)), 0.0, 1.0) for file in files]
     originals = json.loads((found / "capture.json").read_text())["originals"]
     stems = {Path(ours).stem: Path(theirs).stem for ours, theirs in originals.items()}
 

@@ -5,8 +5,16 @@ import pytest
 import torch
 
 from forewarp.data.cameras import FLIP
-from forewarp.data.directions import check_directions, inverted, opposite, other_readings, transposed
-from tests.support.written_scenes import around, refused
+from forewarp.data.directions import (
+    by_translation,
+    check_directions,
+    closer_readings,
+    inverted,
+    opposite,
+    other_readings,
+    transposed,
+)
+from tests.support.written_scenes import UP, around, look_at, refused
 
 CHANGES = {"inverse": inverted, "axes": opposite}
 
@@ -87,6 +95,19 @@ def test_half_inverted_poses_are_recognised(change, said):
     misread = opposite(change(opposite(torch.stack(around()))))
     with refused(said):
         check_directions(list(misread), "t.json", inverse=False)
+
+
+def test_poses_that_meet_much_closer_in_another_way_are_doubted():
+    """Of a narrow rig whose places are translations of world-to-camera matrices axes miss by a third."""
+    aim = torch.tensor([1.0, 0.4, 0.2], dtype=torch.float64)
+    places = [pose[:3, 3] + aim for pose in around(24)[:8]]
+    right = torch.stack([look_at(place, aim, UP).double() for place in places])
+    misread = by_inverse(right)
+    assert other_readings(misread, {"t": by_translation}) == []
+    assert closer_readings(misread, CHANGES | {"t": by_translation}) == ["t"]
+    assert closer_readings(right, CHANGES | {"t": by_translation}) == []
+    (line,) = check_directions(opposite(by_inverse(opposite(right))), "t.json", inverse=False)
+    assert "look at about one thing, and 5 times closer or more if translations are of world-to" in line
 
 
 def test_several_ways_are_named():

@@ -13,7 +13,8 @@ from PIL import Image
 
 from forewarp.data.checks import remarks
 from forewarp.data.depth import SensedDepth
-from forewarp.data.hypernerf import read_camera, read_scene, write_camera
+from forewarp.data.files import Entry, read_json
+from forewarp.data.hypernerf import camera_of, read_scene, write_camera
 from forewarp.data.images import write_image
 from tests.support import reference
 from tests.support.written_scenes import (
@@ -194,15 +195,29 @@ def test_camera_files_that_hold_another_pose_are_named(changes, said, tmp_path):
     assert all(re.search(said, line) for line in lines)
 
 
+def test_positions_that_miss_about_one_point_are_named(tmp_path):
+    """Around a subject beside the origin, translations of world-to-camera miss a point by a third."""
+    folder = write_rig(tmp_path / "toy", rig(times=12))
+    for file in (folder / "camera").iterdir():
+        edit(file, lambda c: c.update(position=(np.array(c["position"]) - CENTER + [1.0, 0.4, 0.2]).tolist()))
+    edit(folder / "scene.json", {"center": [1.0, 0.4, 0.2]})
+    assert "assumed" not in read_scene(tmp_path, "toy").protocol
+    for file in (folder / "camera").iterdir():
+        edit(file, _by_translation)
+    edit(folder / "scene.json", {"center": [0.0, 0.0, 4.0]})
+    (line,) = read_scene(tmp_path, "toy").protocol["assumed"]
+    assert re.search(r"position is the translation t .* \(write -orientation\^T t\); if so", line)
+
+
 def test_both_spellings_of_the_tangential_distortion(tmp_path):
     path = tmp_path / "camera.json"
     write_camera(path, phone(1, size=(1073, 719)))
-    small = read_camera(path, 1, 2).smaller(4)
+    small = camera_of(Entry(path, read_json(path)), 1, 2).smaller(4)
     assert (small.width, small.height, small.lens) == (268, 180, LENS)  # rounded
     edit(path, {"tangential": [0.001, 0.002]})
-    assert read_camera(path, 1, 2).lens.p == (0.001, 0.002)
+    assert camera_of(Entry(path, read_json(path)), 1, 2).lens.p == (0.001, 0.002)
     edit(path, dict.fromkeys(["tangential_distortion", "tangential"], GONE))
-    assert read_camera(path, 1, 2).lens.p == (0, 0)
+    assert camera_of(Entry(path, read_json(path)), 1, 2).lens.p == (0, 0)
 
 
 @pytest.mark.parametrize(
@@ -246,7 +261,7 @@ def test_which_of_two_images_of_one_id_is_read_is_said(tmp_path):
 
 def test_a_genuine_lens_is_undone():
     path = real("hypernerf") / "camera-with-distortion" / "camera.json"
-    camera = read_camera(path, 0.1, 2.0)
+    camera = camera_of(Entry(path, read_json(path)), 0.1, 2.0)
     assert camera.lens.p == tuple(json.loads(path.read_text())["tangential"])
     assert (camera.width, camera.height, camera.skew) == (2448, 3264, 0)
     pixels = torch.arange(0, 2448 * 3264, 4999)

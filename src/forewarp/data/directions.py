@@ -20,10 +20,15 @@ _KEEP = "set data.axes=opengl if they are right"
 _OUTWARDS = "set data.axes=opencv, or data.axes=opengl if they do look outwards"
 _CONVERT = "convert poses of Unity (left-handed) or PyTorch3D (docs/own-data.md)"
 _MEET, _MISS = 0.15, 0.5  # miss of the axes in shares of the distance: they meet in a point, they do not
+_CLOSER = 5.0  # times as close axes meet in another way, from which on it is likelier
+_BOTH = f"cameras look at about one thing, and {_CLOSER:g} times closer or more if {{}}"
 
 
-def check_directions(poses: Sequence[torch.Tensor], where: str, *, inverse: bool, advice: str = "") -> None:
-    """Refuse poses that make sense only if they were written in another way than assumed.
+def check_directions(
+    poses: Sequence[torch.Tensor], where: str, *, inverse: bool, advice: str = ""
+) -> list[str]:
+    """Refuse poses that make sense only if they were written in another way than assumed; say in a line where
+    they make more sense so.
 
     Args:
         poses: as ``transforms.pose_in`` reads them where ``data.axes`` is null.
@@ -36,7 +41,7 @@ def check_directions(poses: Sequence[torch.Tensor], where: str, *, inverse: bool
             nothing in common but their inverses have, or their x axes: naming the key that mends it.
     """
     if len(poses) < _LEAST_CAMERAS:
-        return
+        return []
     poses = torch.stack([*poses])
     miss, ahead, _ = _meeting(poses)
     missed, before, _ = _meeting(x_ahead(poses))
@@ -55,27 +60,38 @@ def check_directions(poses: Sequence[torch.Tensor], where: str, *, inverse: bool
     if got:
         raise mismatch(where, expected, got, advice or mended)
     if inverse:
-        return
+        return []
     expected, got = "camera-to-world matrices", "cameras that look at nothing in common, as their inverses do"
     if keys := other_readings(poses, _KEYS):
         raise mismatch(where, expected, got, advice or f"set {keys[0].replace(' and ', ' ')}, or {_KEEP}")
-    refuse_other_readings(poses, _HALVES, where, expected, advice or f"write them so, or {_KEEP}")
+    if keys := closer_readings(poses, _KEYS):
+        advice = advice or f"set {keys[0].replace(' and ', ' ')}, or {_KEEP}"
+        return [f"{where}: {_BOTH.format(f'read with {keys[0]}')}; {advice}"]
+    return refuse_other_readings(poses, _HALVES, where, expected, advice or f"write them so, or {_KEEP}")
 
 
-def refuse_other_readings(poses, readings, where: object, expected: str, advice="convert them") -> None:
-    """Refuse poses that make sense only in other ways.
+def refuse_other_readings(
+    poses: Sequence[torch.Tensor],
+    changes: Mapping[str, _Change],
+    where: object,
+    expected: str,
+    advice: str = "convert them",
+) -> list[str]:
+    """Refuse poses that make sense only in other ways; say in a line where they make more sense so.
 
     Args:
-        poses, readings: see ``poses`` and ``changes`` of ``other_readings``.
+        poses, changes: see ``other_readings``.
         where, expected, advice: of the error.
 
     Raises:
         SceneError: naming these ways.
     """
-    if ways := other_readings(poses, readings):
+    if ways := other_readings(poses, changes):
         raise mismatch(
             where, expected, f"cameras that look at one thing only if {', or if '.join(ways)}", advice
         )
+    ways = closer_readings(poses, changes)
+    return [f"{where}: {_BOTH.format(', or if '.join(ways))}; if so, {advice}"] if ways else []
 
 
 def other_readings(poses: Sequence[torch.Tensor], changes: Mapping[str, _Change]) -> list[str]:
@@ -90,20 +106,39 @@ def other_readings(poses: Sequence[torch.Tensor], changes: Mapping[str, _Change]
     """
     if len(poses) < _LEAST_CAMERAS:
         return []
-    poses, ways = torch.stack([*poses]), []
-    miss, ahead, _ = _meeting(poses)
-    if (miss < _MEET and ahead > 0) or _MEET <= miss < _MISS:
+    miss, ahead, _ = _meeting(poses := torch.stack([*poses]))
+    are_none = (miss < _MEET and ahead == 0) or miss >= _MISS
+    return _readings_within(poses, changes, _MEET) if are_none else []
+
+
+def closer_readings(poses: Sequence[torch.Tensor], changes: Mapping[str, _Change]) -> list[str]:
+    """Name the changes by which cameras that look at about one point all look at one many times closer, in
+    each way that needs the fewest; none of poses that are likely right.
+
+    Args:
+        poses, changes: see ``other_readings``.
+    """
+    if len(poses) < _LEAST_CAMERAS:
         return []
+    miss, _, _ = _meeting(poses := torch.stack([*poses]))
+    return _readings_within(poses, changes, miss / _CLOSER) if _MEET <= miss < _MISS else []
+
+
+def _readings_within(poses: torch.Tensor, changes: Mapping[str, _Change], most: float) -> list[str]:
+    """Name the fewest changes of poses (N, 4, 4) by which axes miss a point by less than ``most``, and all
+    cameras have it ahead.
+    """
     for count in range(1, len(changes) + 1):
+        ways = []
         for names in combinations(changes, count):
             changed = poses
             for name in names:
                 changed = changes[name](changed)
             miss, ahead, _ = _meeting(changed)
-            ways += [" and ".join(names)] if miss < _MEET and ahead == 1 else []
+            ways += [" and ".join(names)] if miss < most and ahead == 1 else []
         if ways:
-            break
-    return ways
+            return ways
+    return []
 
 
 def opposite(poses: torch.Tensor) -> torch.Tensor:

@@ -42,7 +42,14 @@ from forewarp.data.cameras import (
     pose_of,
 )
 from forewarp.data.depth import METRIC, SensedDepth, depths_beside, doubt_depths, unit_of
-from forewarp.data.directions import by_translation, common_point, opposite, other_readings, transposed
+from forewarp.data.directions import (
+    by_translation,
+    closer_readings,
+    common_point,
+    opposite,
+    other_readings,
+    transposed,
+)
 from forewarp.data.files import (
     Entry,
     SceneError,
@@ -211,7 +218,7 @@ def read_scene(
                 file, "the camera of an image", "none", "write it, or take the id out of dataset.json"
             )
         entry = Entry(file, read_json(file))
-        camera = _camera_of(entry, near, far)
+        camera = camera_of(entry, near, far)
         unread.update(dict.fromkeys(_unread_lens(entry, camera)))
         poses.append(camera.camera_to_world)
         camera = normalised.camera(camera).smaller(scale)
@@ -278,7 +285,7 @@ def read_scene(
         raise mismatch(world.where("center"), "the middle of what is filmed", got, "write that")
     if (line := _doubt_range(poses, size, near, far)) is not None:
         assumed.append(f"{world.file}: near, far: {line}")
-    if ways := other_readings(poses, _READINGS):
+    if ways := other_readings(poses, _READINGS) or closer_readings(poses, _READINGS):
         line = "cameras do not look at one thing, as all of them do if"
         assumed.append(f"{folder / 'camera'}: {line} {', or if '.join(ways)}; if so, write them anew")
     has_masks = any(f.load_valid for f in train)
@@ -356,17 +363,13 @@ def write_scene(
         write_json(folder / f"{name}.json", content)
 
 
-def read_camera(path: Path, near: float, far: float) -> Camera:
-    """Read a camera in the file's units: the unscaled world and the full-size image.
+def camera_of(entry: Entry, near: float, far: float) -> Camera:
+    """Read the camera that a file holds, in its units: the unscaled world and the full-size image.
 
     Raises:
         SceneError: for a key that is missing or has a wrong number of values, for no rotation, and for a lens
             that cannot be undone.
     """
-    return _camera_of(Entry(path, read_json(path)), near, far)
-
-
-def _camera_of(entry: Entry, near: float, far: float) -> Camera:
     check_pinhole(entry)
     width, height = entry.numbers("image_size", 2, 1, _MOST_PIXELS)
     if width % 1 or height % 1:
@@ -408,7 +411,7 @@ def _unread_lens(entry: Entry, camera: Camera) -> list[str]:
 
 
 def write_camera(path: Path, camera: Camera) -> None:
-    """Write a camera for ``read_camera``, every digit of it but near and far, whole or not at all."""
+    """Write a camera for ``camera_of``, every digit of it but near and far, whole or not at all."""
     lens = camera.lens or Lens()
     content = {
         "orientation": camera.camera_to_world[:3, :3].double().T.tolist(),
@@ -472,7 +475,7 @@ def _names(path: Path, key: str, content: dict, ids: list[str] | None = None, tr
         raise mismatch(f"{path}: {key}", "a list of different names", short(names))
     known = {*names} if ids is None else {*ids}
     if unknown := [name for name in names if name not in known]:
-        raise mismatch(f"{path}: {key}", "items of dataset.json's ids", short(unknown[0]), "list it in ids")
+        raise mismatch(f"{path}: {key}", "items of dataset.json's ids", short(unknown[0]), "remove it")
     if both := {*train} & {*names}:
         raise mismatch(f"{path}: {key}", "none of the items to train on", short(min(both)))
     return names
