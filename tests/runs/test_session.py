@@ -1,6 +1,7 @@
 """A run's folder has one process at a time, one config, and the data that it began with."""
 
 import errno
+import json
 import os
 from types import SimpleNamespace
 
@@ -10,6 +11,7 @@ from omegaconf import OmegaConf
 
 from forewarp.data.files import LOCK
 from forewarp.runs.session import check_data, claim, locked, session, warn_if_changed
+from forewarp.scene.world import World
 
 
 @pytest.mark.parametrize("holder", [None, b"", b"\xff\xfe\x00", b"x" * 5000])
@@ -107,7 +109,8 @@ def test_a_folder_is_claimed_for_one_config(tmp_path):
 
 def test_data_that_changed_are_refused_unless_accepted(tmp_path, capsys):
     data = {"texts": {"a.json": "1"}, "images": {"count": 1}}
-    run = SimpleNamespace(folder=tmp_path, datamodule=SimpleNamespace(fingerprint=lambda: data))
+    scene = SimpleNamespace(world=World(scale=0.5))
+    run = SimpleNamespace(folder=tmp_path, datamodule=SimpleNamespace(fingerprint=lambda: data, scene=scene))
     with pytest.raises(ValueError, match="data_changed: expected refuse or accept, but got 'x'"):
         check_data(run, "x")
     check_data(run, "refuse")
@@ -121,6 +124,10 @@ def test_data_that_changed_are_refused_unless_accepted(tmp_path, capsys):
     warn_if_changed(run)
     said = f"{tmp_path}/data.json: expected the data that the run was begun with, but got others: a.json"
     assert capsys.readouterr().err == f"warning: {said}\n"
+    metrics = {"protocol": {"normalisation": {"center": [0, 0, 0], "scale": 5.0}}}
+    (tmp_path / "metrics.json").write_text(json.dumps(metrics))
+    warn_if_changed(run)
+    assert "unit of the data there now, in which lengths are 10 times as large; " in capsys.readouterr().err
     with pytest.raises(ValueError, match="a.json; use run=..., or go on with data_changed=accept"):
         check_data(run, "refuse")
     check_data(run, "accept")

@@ -16,6 +16,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from forewarp.data.files import LOCK, difference, mismatch, one_of, stamps
 from forewarp.files import held, read_json, read_text, refuse_links, replace_file, write_json
+from forewarp.ops.backend import is_number
 from forewarp.provenance import installed
 from forewarp.runs.config import (
     IDENTITY,
@@ -31,6 +32,7 @@ from forewarp.training.stages import Run
 
 PACKAGES = "packages.txt"  # all that was installed when the run was last trained
 UNLOCKED = ("videos", "exports", ".page")  # what is written into a run's folder while another may train it
+_SAME_UNIT = 1e-6  # share by which lengths of one unit may differ
 # Named first in a refusal, as other differences follow from these.
 _TYPED = ("model.name", "data.scene", "data.root", "seed", "preset", "budget")
 
@@ -180,9 +182,23 @@ def check_data(run: Run, changed: str) -> None:
 
 
 def warn_if_changed(run: Run) -> None:
-    """Warn on stderr if the scene's files differ from those in ``data.json``."""
+    """Warn on stderr if the scene's files differ from those in ``data.json``, and if their unit does."""
     if differs := _compared(run)[-1]:
-        print(f"warning: {differs}", file=sys.stderr)
+        print(f"warning: {differs}{_change_of_unit(run)}", file=sys.stderr)
+
+
+def _change_of_unit(run: Run) -> str:
+    """Say by how much lengths in the data there now differ from those that a run was trained on; nothing
+    where they are alike, or that is not known.
+    """
+    protocol = (read_json(Path(run.folder) / "metrics.json") or {}).get("protocol")
+    trained = protocol.get("normalisation") if isinstance(protocol, dict) else None
+    scale = trained.get("scale") if isinstance(trained, dict) else None
+    factor = scale / run.datamodule.scene.world.scale if is_number(scale) else 1.0
+    if abs(factor - 1) < _SAME_UNIT:
+        return ""
+    line = f"exports are in the unit of the data there now, in which lengths are {factor:.4g} times as large"
+    return f"; {line}; for those trained on, put the old data back"
 
 
 def _stamps_of(run: Run) -> dict[str, tuple[int, int]]:
