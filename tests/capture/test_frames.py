@@ -332,6 +332,7 @@ def test_cut_outs_stay_cut_out(tmp_path):
     [
         (2, None, "p: expected a folder of many pictures, PNG or JPEG, but got 2 PNG or JPEG files"),
         (3, ("RGBA", (64, 48), None), "odd.png: expected alpha in all pictures or in none"),
+        (3, ("RGB", (16, 9), None), "odd.png: expected 64 x 48 pixels as most, but got 16 x 9; .*remove it"),
         (3, ("RGB", (64, 48), turned()), "odd.png: expected 64 x 48 pixels as the first, but got 48 x 64"),
     ],
 )

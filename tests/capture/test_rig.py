@@ -143,6 +143,16 @@ def test_a_folder_called_as_videos_are_is_no_camera_left_out_without_a_word(tmp_
         rig.cameras_in(tmp_path)
 
 
+def test_masks_beside_the_films_of_a_rig_are_no_cameras(tmp_path):
+    for name in ("cam0", "cam1", "cam1_mask", "cam1_flow"):
+        write_film(tmp_path / f"{name}.mp4", numbered(3))
+    (tmp_path / "cam0_depth").mkdir()
+    assert list(rig.cameras_in(tmp_path)) == ["cam0", "cam1"]
+    first, second = recordings(tmp_path, None, ["cam1_mask"])
+    assert first.told == [f"{tmp_path}: cam0_depth and 2 more are left out, as what goes with cam0.mp4"]
+    assert second.told == []
+
+
 def test_images_of_another_size_than_a_cameras_first_are_named(tmp_path):
     for name in "ab":
         (tmp_path / name).mkdir()

@@ -1,6 +1,7 @@
 """Videos: the times of their frames, and frames from the middle."""
 
 import subprocess
+from types import SimpleNamespace
 
 import imageio_ffmpeg
 import numpy as np
@@ -126,6 +127,19 @@ def test_two_pictures_in_a_frame_are_refused_and_one_is_cut_out(tmp_path):
     ffmpeg = [imageio_ffmpeg.get_ffmpeg_exe(), "-v", "error", *words]
     subprocess.run(ffmpeg, cwd=tmp_path, check=True)
     assert next(extracted(tmp_path / "one.mp4", None, None)).shape == (48, 32, 3)
+
+
+@pytest.mark.parametrize("kind", ["equirectangular", "half equirectangular", "cubemap", "fisheye"])
+def test_films_of_no_perspective_are_refused_and_turned_to_one(tmp_path, kind, monkeypatch):
+    film = write_film(tmp_path / f"{kind[:4]}.mp4", numbered(1))
+    text = f"      spherical: {kind} (0.000000/0.000000/0.000000)\n".encode()
+    with monkeypatch.context() as patch:
+        patch.setattr(subprocess, "run", lambda *_, **__: SimpleNamespace(stderr=text))
+        with pytest.raises(SceneError, match=f"one that is {kind}; type ffmpeg") as caught:
+            stamps_of(film)
+    words = str(caught.value).split("type ffmpeg ")[1].split(",")[0].split()
+    subprocess.run([imageio_ffmpeg.get_ffmpeg_exe(), "-v", "error", *words], cwd=tmp_path, check=True)
+    assert next(extracted(tmp_path / "front.mp4", None, None)).ndim == 3
 
 
 @pytest.mark.parametrize("size", [(64, 48), (96, 128)])

@@ -136,6 +136,12 @@ class _Scan:
         if images > count:
             advice = "export the scan once more, or remove the images that have none"
             raise mismatch(self.about.where("poses"), f"one of each of {images} images", count, advice)
+        if lacking := [i for i in range(count) if f"rgbd/{i}.jpg" not in archive.NameToInfo]:
+            advice = "export the scan once more"
+            if lacking[-1] - lacking[0] == count - 1 - lacking[0] == len(lacking) - 1:
+                advice += f"; if the recording broke off, remove its last {len(lacking)} poses"
+            got = f"{len(lacking)} of {count} without one, as rgbd/{lacking[0]}.jpg"
+            raise mismatch(self.about.where("poses"), "an image of each", got, advice)
         by_rows = matrix[6] == matrix[7] == 0 < min(matrix[2], matrix[5])
         self.intrinsics = [[matrix[k] for k in ((0, 4, 2, 5) if by_rows else (0, 4, 6, 7))]] * count
         if about.get("perFrameIntrinsicCoeffs"):

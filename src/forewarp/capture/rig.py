@@ -39,7 +39,7 @@ from forewarp.capture.pipeline import ABOUT, PICTURE, keep, kept, record, work_f
 from forewarp.capture.poses import Reconstruction, Search
 from forewarp.capture.sync import MOST as HEARD
 from forewarp.capture.sync import RATE, Synchrony, is_silent, synchronise
-from forewarp.data.files import mismatch, number
+from forewarp.data.files import beside_images, left_out, mismatch, number
 from forewarp.data.images import by, read_image, write_image
 from forewarp.data.names import in_order, read_names
 from forewarp.data.video import VIDEOS, doubts_of, extracted, sound_of, stamps_of, start_of
@@ -122,8 +122,8 @@ def cameras_in(folder: Path) -> dict[str, Path]:
         ValueError: for fewer than two, for two videos of one name, and for a sub-folder called as videos are,
             with another number.
     """
-    there = [path for path in folder.iterdir() if not path.name.startswith(".")]
-    paths = [path for path in there if path.is_file() and path.suffix.lower() in VIDEOS]
+    there, _ = _films_and_beside(folder)
+    paths = [path for path in there if path.is_file()]
     if twice := sorted(path.name for path in paths if sum(path.stem == one.stem for one in paths) > 1):
         raise mismatch(folder, "a video for each camera", " and ".join(twice[:2]))
     found = {path.stem: path for path in paths}
@@ -143,6 +143,12 @@ def cameras_in(folder: Path) -> dict[str, Path]:
     return {name: found[name] for name in in_order(found)}
 
 
+def _films_and_beside(folder: Path) -> tuple[list[Path], dict[Path, Path]]:
+    """List videos and sub-folders, and masks, depth and others that go with one: see ``beside_images``."""
+    there = (path for path in folder.iterdir() if not path.name.startswith("."))
+    return beside_images(sorted(p for p in there if p.is_dir() or p.suffix.lower() in VIDEOS), folder)
+
+
 def recordings(
     folder: Path, rate: float | None, without: Sequence[str] = (), name_pattern: str | None = None
 ) -> list[Recording]:
@@ -157,12 +163,14 @@ def recordings(
     Raises:
         ValueError: for fewer than two, for what is no video, and for a name to leave out that is not there.
     """
-    found = cameras_in(folder)
-    _refuse_unknown("without", without, found)
+    found, (_, beside) = cameras_in(folder), _films_and_beside(folder)
+    _refuse_unknown("without", without, [*found, *(path.stem for path in beside)])
     used = [name for name in found if name not in without]
     if len(used) < 2:
         raise mismatch("without", "at least two cameras left", f"{len(used)} of {len(found)}")
-    return [_recording(name, found[name], rate, name_pattern) for name in used]
+    left = left_out(beside, folder)
+    films = [_recording(name, found[name], rate, name_pattern) for name in used]
+    return [dataclasses.replace(films[0], told=[*left, *films[0].told]), *films[1:]]
 
 
 def _recording(name: str, path: Path, rate: float | None, name_pattern: str | None) -> Recording:

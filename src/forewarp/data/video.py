@@ -30,6 +30,13 @@ _ALPHA = re.compile(
 # Two pictures in a frame, and directions all around.
 _STEREO = re.compile(r"(?i)stereo ?3d: (side by side|top and bottom)")
 _SPHERICAL = re.compile(r"(?i)spherical[^:\n]*: ((?:half )?equirectangular|cubemap|fisheye)")
+# What ffmpeg's v360 calls these.
+_V360 = {
+    "equirectangular": "e:flat",
+    "half equirectangular": "he:flat",
+    "cubemap": "c3x2:flat",
+    "fisheye": "fisheye:flat:ih_fov=180:iv_fov=180",
+}
 _CHANGED = re.compile(r"because video parameters changed to (.*), (\d+)x(\d+)")
 _TRANSFER = re.compile(r"Video: .*\b(" + "|".join(HDR) + r")\b")
 # Of more than 8 bits, with matrix/primaries/transfer of which one of the first is BT.2020's, the last none.
@@ -187,8 +194,12 @@ def _header(video: Path, size: int, changed: int) -> tuple[str, str]:
         advice = f"type ffmpeg -i {video.name} -vf crop={part}:0:0 one.mp4"
         raise mismatch(video, "a film by one lens", f"two pictures in each frame, {both[1]}", advice)
     if all_around := _SPHERICAL.search(told):
-        advice = f"type ffmpeg -i {video.name} -vf v360=e:flat:h_fov=90:v_fov=60 front.mp4"
-        raise mismatch(video, "a film in perspective", f"one of 360 degrees, {all_around[1]}", advice)
+        kind = all_around[1].lower()
+        advice = (
+            f"type ffmpeg -i {video.name} -vf v360={_V360[kind]}:h_fov=90:v_fov=60:w=1280:h=740 front.mp4"
+        )
+        advice += ", with the lens's degrees as ih_fov and iv_fov" if kind == "fisheye" else ""
+        raise mismatch(video, "a film in perspective", f"one that is {kind}", advice)
     return told, best
 
 
