@@ -17,7 +17,7 @@ from forewarp.data.rigs import held_cameras
 from forewarp.scene.box import Box
 from forewarp.scene.camera import Camera
 from tests.support.films import numbered, write_film
-from tests.support.written_scenes import fixed_cameras, grey, placed, refused, write_multicam
+from tests.support.written_scenes import fixed_cameras, grey, placed, refused, say_linear, write_multicam
 
 CAMERAS = fixed_cameras(3)
 
@@ -326,6 +326,22 @@ def test_films_of_two_rates_or_none_at_all_are_refused(films, tmp_path):
     (folder / "cam01.mp4").write_bytes(b"text")
     with refused("cam01.mp4: expected a video, but got another file; copy it again"):
         read_scene(tmp_path, "toy")
+
+
+def test_films_that_drift_are_said(films, tmp_path):
+    folder = shutil.copytree(films / "toy", tmp_path / "toy")
+    for name, step in (("cam00", "40"), ("cam01", "40.2")):
+        write_film(folder / f"{name}.mp4", numbered(30, (32, 48)), stamps=f"N*{step}")
+    (line,) = read_scene(tmp_path, "toy").protocol["assumed"]
+    assert "cam01.mp4: runs apart from cam00.mp4, by 0.12 frames at the end of 30; convert both" in line
+    assert "assumed" not in read_scene(tmp_path, "toy", frames=15).protocol
+
+
+def test_cameras_of_which_one_says_that_it_is_linear_are_said(folder):
+    for path in (folder / "cam01").iterdir():
+        say_linear(path)
+    (line,) = read_scene(folder.parent, "toy").protocol["assumed"]
+    assert f"{folder}: 6 of 18 images say that they are linear" in line
 
 
 @pytest.mark.parametrize("change", [{"fy": 1.0}, {"cx": 3.0}])

@@ -20,6 +20,7 @@ from tests.support.written_scenes import (
     dome_truth,
     place,
     refused,
+    say_linear,
     write_dome,
 )
 
@@ -262,6 +263,29 @@ def test_clouds_that_are_counted_from_0_are_taken_in_order(toy):
     scene = read_scene(toy.parent, "toy")
     assert scene.box == expected
     assert "frame0.npy to frame2.npy (3) taken in the order of the frames" in scene.protocol["assumed"][0]
+
+
+def test_clouds_that_are_counted_from_0_are_taken_so_of_the_first_frames(toy):
+    """More clouds than frames that are read; with one more than frames there are, too, it is said."""
+    expected = read_scene(toy.parent, "toy", frames=2).box
+    for number in (1, 2, 3):
+        cloud = toy / "pointclouds" / f"frame{number}.npy"
+        cloud.rename(cloud.with_name(f"frame{number - 1}.npy"))
+    scene = read_scene(toy.parent, "toy", frames=2)
+    assert scene.box == expected
+    assert "frame0.npy to frame1.npy (2) taken in the order" in scene.protocol["assumed"][0]
+    shutil.copy(toy / "pointclouds" / "frame2.npy", toy / "pointclouds" / "frame3.npy")
+    (line,) = read_scene(toy.parent, "toy", frames=2).protocol["assumed"]
+    assert "frame0 to frame3 are there, of which frame1 is taken for img/0; remove frame0, or" in line
+
+
+def test_images_of_which_some_are_linear_are_said(toy):
+    for path in toy.glob("img/*/img_0002.jpg"):
+        with Image.open(path) as image:
+            image.save(path, "PNG")
+        say_linear(path)
+    (line,) = read_scene(toy.parent, "toy").protocol["assumed"]
+    assert "img: 3 of 12 images say that they are linear" in line
 
 
 def test_two_folders_of_one_number_are_named(toy):

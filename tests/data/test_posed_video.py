@@ -6,7 +6,6 @@ import re
 import shutil
 import unicodedata
 from dataclasses import replace
-from zlib import crc32
 
 import numpy as np
 import pytest
@@ -31,6 +30,7 @@ from tests.support.written_scenes import (
     posed_cameras,
     posed_shots,
     refused,
+    say_linear,
     write_video,
 )
 
@@ -127,6 +127,12 @@ def test_points_of_a_ply_are_those_of_points_npy(tmp_path, kind):
     (folder / "sparse_pc.ply").rename(folder / "cloud.ply")
     edit(folder / FILE, {"ply_file_path": "cloud.ply"})
     torch.testing.assert_close(read_scene(tmp_path, "ply").still, expected)
+    table["x"][3:] = np.nan
+    text = "\n".join(" ".join(map(str, row)) for row in table.tolist())
+    body = text.encode() if kind == "ascii" else table.tobytes()
+    (folder / "cloud.ply").write_bytes(head.encode() + body)
+    with refused(r"cloud.ply: expected finite numbers, but got \[nan, .* in row 3 and 2 such rows"):
+        read_scene(tmp_path, "ply")
     (folder / "cloud.ply").unlink()
     scene = read_scene(tmp_path, "ply")
     assert scene.still is None
@@ -145,7 +151,8 @@ def test_points_of_a_ply_are_those_of_points_npy(tmp_path, kind):
             r"vertices of plain numbers .*, x, y, z too, but got \[\('x', 'f4'\)\]",
         ),
         (HEAD.format("binary_little_endian", 9) + "short", "expected 9 vertices, but got a file that ends"),
-        (HEAD.format("ascii", 2) + "0 0 0\n1 1\n", "expected 6 finite numbers, but got 5 values"),
+        (HEAD.format("ascii", 2) + "0 0 0\n1 1\n", "expected 2 vertices, but got a file that ends"),
+        (HEAD.format("ascii", 2) + "0 0 0\n1 1 x\n", "vertex 1: expected 3 finite numbers, but got '1 1 x'"),
         (HEAD.format("ascii", 1).replace("float z", "list uchar int z") + "0", "vertices of plain numbers"),
     ],
 )
@@ -493,11 +500,7 @@ def test_an_empty_path_of_a_mask_is_absent(tmp_path, made):
 
 def test_images_of_which_some_are_linear_are_told(tmp_path, made):
     made()
-    path = tmp_path / "toy/images/frame_2.png"
-    content = path.read_bytes()
-    chunk = b"gAMA" + (100000).to_bytes(4, "big")
-    chunk = (4).to_bytes(4, "big") + chunk + crc32(chunk).to_bytes(4, "big")
-    path.write_bytes(content[:33] + chunk + content[33:])  # behind the header
+    say_linear(tmp_path / "toy/images/frame_2.png")
     said = "\n".join(read_scene(tmp_path, "toy").protocol["assumed"])
     assert (
         "1 of 10 images say that they are linear (gAMA 1; frame_2.png, ..), and all are read as sRGB" in said

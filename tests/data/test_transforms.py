@@ -41,6 +41,10 @@ def camera(stored=(80, 60), common=None, **own):
         ({"fl_x": 90, "common": {"fl_x": 60, "fl_y": 60}}, 90, 90, 40),
         ({"fl_x": 90, "common": {"fl_y": 70}}, 90, 70, 40),
         ({"camera_angle_y": 2 * math.atan(0.375)}, 80, 80, 40),  # of the height, where it stands alone
+        ({"camera_angle_y": 2 * math.atan(0.375), "common": {"fl_x": 90}}, 80, 80, 40),
+        ({"camera_angle_y": 2 * math.atan(0.375), "common": {"fl_x": 90, "fl_y": 45}}, 160, 80, 40),
+        ({"camera_angle_y": 2 * math.atan(0.375), "common": {"camera_angle_x": 1.0}}, 80, 80, 40),
+        ({"camera_angle_y": 41.0, "common": {"fl_x": 90}}, 90, 90, 40),  # no angle
     ],
 )
 def test_one_reading_of_intrinsics(keys, fx, fy, cx):

@@ -7,6 +7,7 @@ from dataclasses import replace
 from functools import reduce
 from operator import getitem
 from pathlib import Path
+from zlib import crc32
 
 import numpy as np
 import pytest
@@ -34,6 +35,13 @@ def real(folder: str) -> Path:
 def refused(match):
     """What a user gave is refused in a line like this."""
     return pytest.raises(SceneError, match=match)
+
+
+def say_linear(path):
+    """Let a PNG say that its colours are linear."""
+    content, chunk = path.read_bytes(), b"gAMA" + (100000).to_bytes(4, "big")
+    chunk = (4).to_bytes(4, "big") + chunk + crc32(chunk).to_bytes(4, "big")
+    path.write_bytes(content[:33] + chunk + content[33:])  # behind the header
 
 
 def edit(path, change):

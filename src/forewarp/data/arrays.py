@@ -104,15 +104,27 @@ def _ply_places(path: Path) -> np.ndarray:
         raise mismatch(path, expected, f"{columns or 'none'}")
     count = int(vertices[0][-1])
     if order == "=":
-        words = body.split()[: count * len(columns)]
-        table = numbers_of([word.decode("latin1") for word in words], count * len(columns), str(path))
-        rows = dict(zip(dict(columns), np.array(table).reshape(count, len(columns)).T))
+        table = _ply_rows(body.decode("latin1").split(), count, len(columns), path)
+        rows = dict(zip(dict(columns), table.T))
     else:
         dtype, begin = np.dtype([(name, order + kind) for name, kind in columns]), body.find(b"\n") + 1
         if len(body) - begin < count * dtype.itemsize:
             raise mismatch(path, f"{count} vertices", "a file that ends before", "copy it again")
         rows = np.frombuffer(body, dtype, count, begin)
     return np.stack([np.asarray(rows[name], np.float64) for name in "xyz"], 1)
+
+
+def _ply_rows(words: list[str], count: int, columns: int, path: Path) -> np.ndarray:
+    """Parse the numbers (count, columns) of a text; those that are not finite, too."""
+    if len(words) < count * columns:
+        raise mismatch(path, f"{count} vertices", "a file that ends before", "copy it again")
+    words = words[: count * columns]
+    try:
+        return np.array(words, np.float64).reshape(count, columns)
+    except ValueError:
+        for row in range(count):  # which names the first that is no number
+            numbers_of(words[row * columns : (row + 1) * columns], columns, f"{path}: vertex {row}")
+        raise
 
 
 def write_array(path: Path, values: Tensor | np.ndarray | None, dtype: type = np.float32) -> None:

@@ -46,7 +46,16 @@ from forewarp.data.files import (
     scene_folder,
     whole,
 )
-from forewarp.data.images import StoredImage, alpha_of, by, check_pixels, inspect_image, write_image
+from forewarp.data.images import (
+    StoredImage,
+    alpha_of,
+    by,
+    check_pixels,
+    inspect_image,
+    mixed_linear,
+    write_image,
+    wrong_size,
+)
 from forewarp.data.transforms import (
     ListedImage,
     check_times,
@@ -232,7 +241,8 @@ def _common(records: Sequence[_Record]) -> tuple[tuple[int, int], bool]:
     first, sizes = records[0], [(record.camera.width, record.camera.height) for record in records]
     for record, size in zip(records, sizes):
         if size != sizes[0]:
-            raise mismatch(record.path, f"{by(sizes[0])} pixels as the first", by(size))
+            advice = f"remove it from {record.entry.file.name}"
+            raise wrong_size(record.path, sizes[0], size, " as the first", advice)
     bare = [record for record in records if not record.has_alpha]
     if 0 < len(bare) < len(records):
         got = f"{len(bare)} of {len(records)} without, as {bare[0].path}"
@@ -257,6 +267,7 @@ def _read_records(
         records[split] = [record for part, _ in parts for record in part]
         assumed += [line for _, lines in parts for line in lines]
     everything = [record for split in SPLITS for record in records[split]]
+    assumed += mixed_linear({record.path: record.header for record in everything}, folder)
     names = [_name(folder, record) for record in everything]
     cameras = [record.camera for record in everything]
     times, told = times_of(names, [record.time for record in everything], str(folder), name_pattern, cameras)
@@ -284,7 +295,8 @@ def _read_records(
             wanted = f"as in transforms_{other}.json" if other else "all in OpenGL's axes (docs/own-data.md)"
             advice = f"write them {wanted}, or set data.axes=opengl if they are right"
         if axes is None:
-            check_directions(poses, f"{folder}: {split} images", inverse=inverse, advice=advice)
+            where = f"{folder}: {split} images"
+            assumed += check_directions(poses, where, inverse=inverse, advice=advice)
         if split != "train" and (both := sum(record.path in trained for record in records[split])):
             assumed.append(f"{folder}: {both} {split} images are trained on, too; their scores say little")
     upright = [record.entry for record in everything if record.camera.height > record.camera.width]

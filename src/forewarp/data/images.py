@@ -6,6 +6,7 @@ import io
 import mmap
 import os
 import weakref
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -18,7 +19,7 @@ from PIL import Image, ImageOps, UnidentifiedImageError
 from torch import Tensor
 
 from forewarp.clock import left_out
-from forewarp.data.files import mismatch, number, one_of, opened, read_bytes
+from forewarp.data.files import SceneError, mismatch, number, one_of, opened, read_bytes
 from forewarp.files import MOST_IMAGE, written_whole
 from forewarp.media import MOST_PIXELS, TooManyPixels, open_image
 from forewarp.ops.grid import block_means, block_sums
@@ -145,11 +146,19 @@ def inspect_image(path: Path, size: tuple[int, int] | None = None, why: str = ""
     with opened(path, MOST_IMAGE, "an image") as stream:
         header = _inspect(stream, path)
     if size not in (None, header.size):
-        (width, height), found = size, header.size
-        is_like = abs(found[0] * height - found[1] * width) <= max(*size, *found)
-        advice = TURN if found == (height, width) else f"resize it to {by(size)}" * is_like
-        raise mismatch(path, f"{by(size)} pixels{why}", by(header.size), advice)
+        raise wrong_size(path, size, header.size, why)
     return header
+
+
+def wrong_size(
+    path: Path, size: tuple[int, int], stored: tuple[int, int], why: str, advice: str = ""
+) -> SceneError:
+    """Make the error that an image is not of a ``size`` (width, height) that ``why`` tells, with ``advice``
+    beside turning or resizing it.
+    """
+    is_like = abs(stored[0] * size[1] - stored[1] * size[0]) <= max(*size, *stored)
+    mended = TURN if stored == size[::-1] else f"resize it to {by(size)}" * is_like
+    return mismatch(path, f"{by(size)} pixels{why}", by(stored), ", or ".join(filter(None, [mended, advice])))
 
 
 def exif_turned(paths: Sequence[Path], where: object) -> list[str]:
@@ -179,13 +188,14 @@ def common_header(paths: Iterable[Path], one_size: bool = True) -> Header:
     """Check images that must have one size, unless ``one_size`` is false; alpha where all of them have it.
 
     Raises:
-        SceneError: as ``inspect_image``, and where one differs in size from the first.
+        SceneError: as ``inspect_image``, and where one differs in size from most.
     """
-    size, have_alpha = None, True
-    for path in paths:
-        header = inspect_image(path, size if one_size else None, " as the first")
-        size, have_alpha = header.size, have_alpha and header.has_alpha
-    return Header(size, have_alpha)
+    headers = {path: inspect_image(path) for path in paths}
+    size = Counter(header.size for header in headers.values()).most_common(1)[0][0]
+    for path, header in headers.items() if one_size else ():
+        if header.size != size:
+            raise wrong_size(path, size, header.size, " as most", "remove it")
+    return Header(size, all(header.has_alpha for header in headers.values()))
 
 
 def read_image(path: Path, size: tuple[int, int] | None = None, *, upright: bool = False) -> Tensor:

@@ -14,8 +14,8 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -44,10 +44,12 @@ from forewarp.data.films import STORE, Film
 from forewarp.data.images import (
     CACHE,
     TURN,
+    Header,
     StoredImage,
     by,
     exif_turned,
     inspect_image,
+    mixed_linear,
     read_image,
 )
 from forewarp.data.names import in_order, read_names
@@ -61,7 +63,8 @@ FILE = "poses_bounds.npy"
 _COMPARED = 24  # views, at most, by which an order is told
 _AGREES = 0.8  # error of the right order as a share of the other's, at most
 _EVEN = 0.1  # frames by which even times may be off
-_MOST_APART = 0.5  # frames by which two videos may run apart
+_TAIL = 10  # the part of a film, a tenth, that is its end
+_MOST_APART, _DRIFT = 0.5, 0.1  # frames by which two videos may run apart, and do so without a word
 # A camera's axes down, right, backwards to OpenCV's, and back.
 _ROLLED = 0.02  # by which the mean of upward axes is shorter than that of horizontal ones
 _AXES = torch.tensor([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]], dtype=torch.float64)
@@ -75,17 +78,17 @@ _READINGS = {  # what else may be in a row
 class _Track:
     """What a camera took: a video at ``path``, or ``images`` in a folder, ``size`` (width, height) on disk.
 
-    ``stamps`` are the seconds of a video's frames, None of a folder; ``turned`` the images that their EXIF
-    orientation turns; ``numbers`` are those in their names, ascending; ``told`` says what was left out.
+    ``stamps`` are the seconds of a video's frames, None of a folder; ``headers`` what each image says of
+    itself; ``numbers`` are those in their names, ascending; ``assumed`` says what was left out.
     """
 
     path: Path
     size: tuple[int, int]
     stamps: np.ndarray | None = None
     images: tuple[Path, ...] = ()
-    turned: frozenset[Path] = frozenset()
+    headers: Mapping[Path, Header] = field(default_factory=dict)
     numbers: np.ndarray | None = None
-    told: Sequence[str] = ()
+    assumed: Sequence[str] = ()
 
     def __len__(self) -> int:
         return len(self.images) if self.stamps is None else len(self.stamps)
@@ -136,7 +139,7 @@ def read_scene(
     folder = scene_folder(root, scene, "DyNeRF")
     one_of(normalise, "data.normalise", True, False)
     scale, every = whole(scale, "data.scale", 1), whole(test_every, "data.test_every", 1)
-    paths, others, told = _paths(folder)
+    paths, others, left = _paths(folder)
     one_of(camera_order, "data.camera_order", "number", "text", None)
     tracks = [_look(path, name_pattern) for path in paths.values()]
     images = lambda: [small_image(_first_image(track)) for track in tracks]  # noqa: E731
@@ -152,9 +155,10 @@ def read_scene(
         some = ", ".join(others[:3]) + ", .." * (len(others) > 3)
         ordered.append(f"{folder}: {some} not read, as names of cameras begin with cam")
     count, assumed = _moments(tracks, None if frames is None else whole(frames, "data.frames", 1), folder)
-    turned = [path for track in tracks for path in track.images[:count] if path in track.turned]
-    told += [line for track in tracks for line in track.told][:1]  # all cameras are alike
-    assumed += told + ordered + exif_turned(turned, folder)
+    headers = {path: track.headers[path] for track in tracks for path in track.images[:count]}
+    turned = [path for path, header in headers.items() if header.is_turned]
+    left += [line for track in tracks for line in track.assumed][:1]  # all cameras are alike
+    assumed += left + ordered + exif_turned(turned, folder) + mixed_linear(headers, folder)
     assumed += side_files([folder], [], "this layout has none: use experiment=video_with_poses for them")
     default = [0] if len(paths) > 1 else []  # one camera may be tested on moments
     held, moments = held_cameras(test_cameras, list(paths), default), held_moments(test_moments, count)
@@ -246,7 +250,7 @@ def _paths(folder: Path) -> tuple[dict[str, Path], list[str], list[str]]:
     folders = {path: place for path, place in inner if _images(place)}
     cameras, sides = beside_images([*folders, *films], folder)
     unsaid = {path: image for path, image in sides.items() if not SIDE_FILES.search(path.name)}
-    told = left_out(unsaid, folder)  # of masks and depth ``side_files`` speaks
+    left = left_out(unsaid, folder)  # of masks and depth ``side_files`` speaks
     found, twice = {}, []
     for path in cameras:
         taken = found.setdefault(path.name if path in folders else path.stem, path)
@@ -254,7 +258,7 @@ def _paths(folder: Path) -> tuple[dict[str, Path], list[str], list[str]]:
     if twice:
         (taken, other), more = twice[0], f", and so of {len(twice) - 1} more" if twice[1:] else ""
         name = f"{taken.name}{'/' if taken in folders else ''}"
-        told.append(f"{folder}: {name} is read, not {other.name}{more}; remove what is old")
+        left.append(f"{folder}: {name} is read, not {other.name}{more}; remove what is old")
     found = {name: folders.get(path, path) for name, path in found.items()}
     there = [path for path in folder.glob("[!.]*") if path.suffix.lower() in VIDEOS]
     deep = [path for path in folder.glob("[!.]*/") if _images(path) or _images(path / "images")]
@@ -271,7 +275,7 @@ def _paths(folder: Path) -> tuple[dict[str, Path], list[str], list[str]]:
         raise mismatch(folder, expected, got, advice)
     others = {path.name for path in (*there, *deep) if path.stem not in found and path.name not in found}
     others = in_order(name for name in others - {path.name for path in sides} if not SIDE_FILES.search(name))
-    return {name: found[name] for name in in_order(found)}, others, told
+    return {name: found[name] for name in in_order(found)}, others, left
 
 
 def _images(folder: Path) -> list[Path]:
@@ -283,7 +287,7 @@ def read_rows(path: Path, names: Sequence[str]) -> list[Camera]:
     """Read the cameras of whole images, their near and far the depths of the nearest and the farthest matter.
 
     Raises:
-        SceneError: naming the row, or saying in which other way poses seem to be written.
+        SceneError: naming the row.
     """
     array = load_numpy(path)
     check_shape(array, path, "17 numbers for each camera", None, 17, advice="write them as LLFF does")
@@ -305,8 +309,6 @@ def read_rows(path: Path, names: Sequence[str]) -> list[Camera]:
             raise mismatch(f"{where}: bounds", "0 < near < far", f"{near:g} and {far:g}")
         middle = width / 2, height / 2
         cameras.append(Camera(int(width), int(height), focal, focal, *middle, pose, near, far))
-    expected = "[R | T] camera-to-world with the axes down, right, backwards"
-    refuse_other_readings([camera.camera_to_world for camera in cameras], _READINGS, path, expected)
     return cameras
 
 
@@ -334,9 +336,12 @@ def ordered_rows(
         key: what to do where they do not tell.
 
     Raises:
-        SceneError: as ``read_rows``, and where neighbouring views do not tell.
+        SceneError: as ``read_rows``, where poses seem to be written in another way, and where neighbouring
+            views do not tell.
     """
-    cameras, texts, lines = read_rows(path, names), sorted(names), []
+    cameras, texts = read_rows(path, names), sorted(names)
+    expected = "[R | T] camera-to-world with the axes down, right, backwards"
+    lines = refuse_other_readings([c.camera_to_world for c in cameras], _READINGS, path, expected)
     if _rolled(cameras):
         line = "cameras seem to be turned by a quarter about their axes, as rows without LLFF's turn are"
         advice = "if images are upright, write [R | T] with the axes down, right, backwards"
@@ -370,24 +375,22 @@ def _first_image(track: _Track) -> Tensor:
 def _look(path: Path, name_pattern: str | None) -> _Track:
     """Find the size and number of a camera's frames."""
     if path.is_dir():
-        images, told = images_alone(_images(path), path)
-        turned, size = set(), None
+        images, left = images_alone(_images(path), path)
+        headers, size = {}, None
         read = read_names([image.stem for image in images], str(path), name_pattern, one_camera=True)
         numbers = np.arange(len(images)) if read is None else np.array(read.frames)
         order = np.argsort(numbers, kind="stable")
         images, numbers = tuple(images[i] for i in order), numbers[order]
         for image in images:
-            header = inspect_image(image, size, " as the first")
-            size = header.size
-            turned |= {image} if header.is_turned else set()
+            headers[image] = inspect_image(image, size, " as the first")
+            size = headers[image].size
         place = path.parent if path.name == "images" else path
-        return _Track(place, size, None, images, frozenset(turned), numbers, told)
+        return _Track(place, size, None, images, headers, numbers, left)
     stamps = stamps_of(path)
     first = next(extracted(path, [0], None), None) if len(stamps) else None
     if first is None:
         raise mismatch(path, "a video", "another file", "copy it again")
-    told = [f"{path}: {line}" for line in doubts_of(path)]
-    return _Track(path, first.shape[1::-1], stamps, told=told)
+    return _Track(path, first.shape[1::-1], stamps, assumed=[f"{path}: {line}" for line in doubts_of(path)])
 
 
 def _moments(tracks: Sequence[_Track], most: int | None, folder: Path) -> tuple[int, list[str]]:
@@ -417,6 +420,10 @@ def _moments(tracks: Sequence[_Track], most: int | None, folder: Path) -> tuple[
             expected = f"frames at the times of {films[0].path.name}, {rates[0]:.4g} a second"
             got = f"{rates[1]:.4g} a second, {abs(mine[at] - first[at]):.3g} s apart at frame {at}"
             raise mismatch(film.path, expected, got, "convert all to one constant rate, or remove the camera")
+        drift = float(np.median(apart[-max(1, count // _TAIL) :]))  # one frame may come late
+        if drift > _DRIFT:
+            line = f"runs apart from {films[0].path.name}, by {drift:.2g} frames at the end of {count}"
+            assumed.append(f"{film.path}: {line}; convert both to one constant rate, or set data.frames")
     folders = [track for track in tracks if track.images]
     for track in folders if films else ():
         first, steps = track.numbers[0], np.diff(track.numbers[:count])

@@ -309,7 +309,7 @@ def read_names(
     if _may_roll(frames):
         readings = f"numbers to {max(frames):.0f}, where a counter began anew, or with a gap"
         raise _two_ways(where, names[0], readings)
-    refuse_far(dict(zip(names, frames)), where, "number", f"rename it, or {KEY}")
+    refuse_far(dict(zip(names, frames)), where, "number", f"rename or remove it, or {KEY}")
     _check_groups(reading, names, where, views, any(_camera_word(rows, i) for i in places))
     if len({*frames}) < len(frames):
         told += "; images of one number share a time"
@@ -588,7 +588,8 @@ def _of_one_form(written: Sequence[str], names: Sequence[str], where: str) -> li
     if 0 < len(odd) <= _ODD * len(names):
         like = names[counts.index(usual)]
         more = f" and {len(odd) - 1} more" if len(odd) > 1 else ""
-        raise mismatch(where, f"names of one form, as '{like}'", f"'{odd[0]}'{more}", f"rename it, or {KEY}")
+        expected = f"names of one form, as '{like}'"
+        raise mismatch(where, expected, f"'{odd[0]}'{more}", f"rename or remove it, or {KEY}")
     for i in range(1, min(counts), 2):
         before = {row[i - 1] for row in rows}
         if len({text.rstrip("-") for text in before}) < len(before):
@@ -939,7 +940,7 @@ def _check_groups(
     for group, camera in zip(groups, dict.fromkeys(reading.cameras)):
         if len(group) == 1 and max(map(len, groups)) > _ODD_ALONE and not _SPLIT_WORD.search(first[camera]):
             expected = f"names of one form, as '{next(n for n in names if n != first[camera])}'"
-            raise mismatch(where, expected, f"'{first[camera]}'", f"rename it, or {KEY}")
+            raise mismatch(where, expected, f"'{first[camera]}'", f"rename or remove it, or {KEY}")
     step = min(b - a for a, b in zip(everything, everything[1:]))
     for group, camera in zip(groups, dict.fromkeys(reading.cameras)):
         span = max(group) - min(group)

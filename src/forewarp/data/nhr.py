@@ -20,8 +20,27 @@ import torch
 from forewarp.data.arrays import read_cloud, read_truth, shortened, write_array, write_truth
 from forewarp.data.cameras import box_of, check_camera, near_origin, pose_of
 from forewarp.data.directions import inverted, opposite, refuse_other_readings
-from forewarp.data.files import SceneError, mismatch, numbers_of, one_of, opened, remove, scene_folder, whole
-from forewarp.data.images import StoredImage, by, check_pixels, exif_turned, inspect_image, write_image
+from forewarp.data.files import (
+    SceneError,
+    mismatch,
+    nearly,
+    numbers_of,
+    one_of,
+    opened,
+    remove,
+    scene_folder,
+    whole,
+)
+from forewarp.data.images import (
+    Header,
+    StoredImage,
+    by,
+    check_pixels,
+    exif_turned,
+    inspect_image,
+    mixed_linear,
+    write_image,
+)
 from forewarp.data.rigs import held_cameras, held_moments, split_rig
 from forewarp.files import decoded, replace_file
 from forewarp.scene.box import Box
@@ -78,12 +97,15 @@ def read_scene(
     """
     folder = scene_folder(root, scene, "NHR")
     one_of(half_resolution, "data.half_resolution", True, False)
-    poses, matrices = _read_poses(folder / "CamPose.inf"), _read_intrinsics(folder / "Intrinsic.inf")
+    poses, doubted = _read_poses(folder / "CamPose.inf")
+    matrices = _read_intrinsics(folder / "Intrinsic.inf")
     if len(poses) != len(matrices):
         got = f"{len(matrices)} there and {len(poses)} in CamPose.inf"
-        raise mismatch(folder / "Intrinsic.inf", "as many cameras as poses", got)
+        advice = "write the block or line of the camera that one of them lacks, or remove it from both"
+        raise mismatch(folder / "Intrinsic.inf", "as many cameras as poses", got, advice)
     if len(poses) < 2:
-        raise mismatch(folder / "CamPose.inf", "at least 2 cameras, one to measure", "1")
+        advice = "write a line of CamPose.inf and a block of Intrinsic.inf for each camera"
+        raise mismatch(folder / "CamPose.inf", "at least 2 cameras, one to measure", "1", advice)
     tests = max(1, round(len(poses) * 6 / 56))
     spread_out = [i * len(poses) // tests for i in range(tests)]
     held = held_cameras(test_cameras, [*map(str, range(len(poses)))], spread_out)
@@ -100,8 +122,10 @@ def read_scene(
     counted = (path.stem[4:] for place in places for path in place.glob("img_*.jpg"))
     first = min((int(number) for number in counted if number.isdecimal()), default=0)
     names = [f"img_{k:04d}.jpg" for k in range(first, first + len(poses))]
-    sizes, turned = _read_sizes(places[:moments], names, half_resolution)
-    bounds, assumed = _bounds(folder, numbers, len(places)) if box is None else (box_of(box), [])
+    sizes, headers = _read_sizes(places[:moments], names, half_resolution)
+    turned = [path for path, header in headers.items() if header.is_turned]
+    images = {path: header for path, header in headers.items() if path.parent.name != "mask"}
+    bounds, assumed = _bounds(folder, numbers, on_disk) if box is None else (box_of(box), [])
     cameras = [_camera(*of, half_resolution, bounds) for of in zip(sizes, matrices, poses, strict=True)]
     for number, camera in enumerate(cameras):
         where = f"{folder / 'Intrinsic.inf'}: camera {number}"
@@ -122,6 +146,7 @@ def read_scene(
     if on_disk[0] != 0 or first != 0 or on_disk[-1] - on_disk[0] >= len(on_disk):
         said = f"frames {on_disk[0]} to {on_disk[-1]} ({len(on_disk)}) and cameras from {first}"
         assumed = [f"{folder / 'img'}: {said} taken in order, times by their numbers", *assumed]
+    assumed += doubted + exif_turned(turned, folder / "img") + mixed_linear(images, folder / "img")
     protocol = {
         "dataset": "nhr",
         "resolution": [list(size) for size in sorted({(c.width, c.height) for c in cameras}, reverse=True)],
@@ -133,7 +158,7 @@ def read_scene(
         "normalisation": None if world.is_same else {"center": list(world.center), "scale": world.scale},
         "mask_box": True,
         "test_moments": sorted(held_times) or None,
-        "assumed": [*assumed, *exif_turned(turned, folder / "img")] or None,
+        "assumed": assumed or None,
     }
     truth = read_truth(folder / "trajectories.npz", 0.0, world)
     if truth is not None and moments < len(places):  # the file's times are those of all frames on disk
@@ -176,8 +201,9 @@ def write_scene(
     replace_file(folder / "CamPose.inf", poses)
 
 
-def _read_poses(path: Path) -> list[np.ndarray]:
-    """Read camera-to-world matrices (4, 4) float64 with OpenCV's axes, one a line.
+def _read_poses(path: Path) -> tuple[list[np.ndarray], list[str]]:
+    """Read camera-to-world matrices (4, 4) float64 with OpenCV's axes, one a line; also say in a line where
+    they may be written in another way.
 
     Raises:
         SceneError: naming the line that does not hold 12 numbers, or no rotation; and where the cameras would
@@ -196,8 +222,7 @@ def _read_poses(path: Path) -> list[np.ndarray]:
             except SceneError:
                 raise error from None
             raise mismatch(where, expected, "its rows", "write the columns one after the other") from None
-    refuse_other_readings([torch.from_numpy(pose) for pose in poses], _READINGS, path, expected)
-    return poses
+    return poses, refuse_other_readings([*map(torch.from_numpy, poses)], _READINGS, path, expected)
 
 
 def _read_intrinsics(path: Path) -> list[np.ndarray]:
@@ -234,11 +259,13 @@ def _lines(path: Path) -> list[tuple[int, list[str]]]:
     return lines
 
 
-def _read_sizes(folders: list[Path], names: list[str], halve: bool) -> tuple[list[tuple], list[Path]]:
-    """Read the size (width, height) of every camera's images and check that all have it; also list those that
-    their EXIF orientation turns.
+def _read_sizes(
+    folders: list[Path], names: list[str], halve: bool
+) -> tuple[list[tuple[int, int]], dict[Path, Header]]:
+    """Read the size (width, height) of every camera's images and check that all have it; also return the
+    headers of images and masks.
     """
-    sizes, turned = [None] * len(names), []
+    sizes, headers = [None] * len(names), {}
     for folder in folders:
         for place in (folder, folder / "mask"):
             if extra := sorted({path.name for path in place.glob("img_*")}.difference(names)):
@@ -247,37 +274,51 @@ def _read_sizes(folders: list[Path], names: list[str], halve: bool) -> tuple[lis
                 raise mismatch(place / extra[0], expected, "another", advice)
             for k, name in enumerate(names):
                 why = f" as in img/{folders[0].name}/{name}"
-                header = inspect_image(place / name, sizes[k], why)
-                sizes[k] = header.size
-                turned += [place / name] if header.is_turned else []
+                if not (place / name).is_file():
+                    what = "the mask of an image" if place is not folder else f"an image of camera {k}"
+                    advice = f"add it, or remove the folder img/{folder.name}"
+                    raise mismatch(place / name, what, "none", nearly(place / name) or advice)
+                headers[place / name] = inspect_image(place / name, sizes[k], why)
+                sizes[k] = headers[place / name].size
                 if halve and min(sizes[k]) < 2:
                     raise mismatch(place / name, "at least 2 x 2 pixels to halve", by(sizes[k]))
-    return sizes, turned
+    return sizes, headers
 
 
-def _bounds(folder: Path, numbers: Sequence[int], count: int) -> tuple[Box, list[str]]:
-    """Put a box around the points of the frames of these numbers, the first of ``count``, with some padding.
+def _bounds(folder: Path, numbers: Sequence[int], on_disk: Sequence[int]) -> tuple[Box, list[str]]:
+    """Put a box around the points of the frames of these numbers, the first of those on disk, with some
+    padding.
 
-    A cloud's number is its frame's and 1; as many clouds as frames, of an excerpt, may be in their order,
-    which the lines that come with the box say.
+    A cloud's number is its frame's and 1; those of an excerpt may be in its order, and others count from 0 as
+    the frames do, which the lines that come with the box say.
     """
+    place = folder / "pointclouds"
     paths = (*folder.glob("pointclouds/frame*.obj"), *folder.glob("pointclouds/frame*.npy"))  # .npy wins
     clouds = {int(path.stem[5:]): path for path in paths if path.stem[5:].isdecimal()}
-    chosen = [clouds.get(number + 1, folder / "pointclouds" / f"frame{number + 1}.npy") for number in numbers]
-    assumed, are_there = [], all(path.is_file() for path in chosen)
-    if not are_there and len(clouds) == count and (numbers[0] != 0 or 0 in clouds):
-        chosen = [clouds[number] for number in sorted(clouds)][: len(numbers)]
-        said = f"{chosen[0].name} to {chosen[-1].name} ({len(chosen)}) taken in the order of the frames"
-        assumed = [f"{folder / 'pointclouds'}: {said}"]
-    clouds = (read_cloud(path, 6)[:, :3] for path in chosen)
-    corners = np.array([(points.min(0), points.max(0)) for points in clouds], np.float64)
+    counted = [number + 1 for number in numbers]
+    is_from_0 = on_disk[0] == 0 and 0 in clouds
+    is_excerpt = on_disk[0] != 0 and any(number not in clouds for number in counted)
+    assumed = []
+    if is_from_0 and on_disk[-1] + 1 in clouds:
+        line = f"frame0 to frame{on_disk[-1] + 1} are there, of which frame1 is taken for img/0"
+        assumed = [f"{place}: {line}; remove frame0, or the last if clouds count from 0"]
+    elif is_from_0 or (is_excerpt and len(clouds) == len(on_disk)):
+        counted = sorted(clouds)[: len(numbers)] if len(clouds) == len(on_disk) else numbers
+        ends = " to ".join(clouds[counted[k]].name for k in (0, -1) if counted[k] in clouds)
+        said = f"{ends} ({len(counted)}) taken in the order of the frames"
+        assumed = [f"{place}: {said}"]
+    if lacking := [number for number in counted if number not in clouds]:
+        advice = "add it, or set data.box=[x0,y0,z0,x1,y1,z1]"
+        raise mismatch(place / f"frame{lacking[0]}.npy", "a point cloud of each frame", "none", advice)
+    points_of = (read_cloud(clouds[number], 6)[:, :3] for number in counted)
+    corners = np.array([(points.min(0), points.max(0)) for points in points_of], np.float64)
     low, high = corners.min((0, 1)), corners.max((0, 1))
     margin = _PADDING * (high - low)
     try:
         return Box((low - margin).tolist(), (high + margin).tolist()), assumed
     except ValueError as error:
         got = f"{low.tolist()} to {high.tolist()}"
-        raise mismatch(folder / "pointclouds", "points that span a box", got, "set data.box") from error
+        raise mismatch(place, "points that span a box", got, "set data.box") from error
 
 
 def _camera(size: tuple[int, int], matrix: np.ndarray, pose: np.ndarray, halve: bool, box: Box) -> Camera:

@@ -62,6 +62,7 @@ from forewarp.data.images import (
     check_pixels,
     hides_image,
     inspect_image,
+    mixed_linear,
     write_image,
 )
 from forewarp.data.names import in_order, read_names
@@ -192,7 +193,7 @@ def read_scene(
     else:
         content = stated(read_json(file))
     entries, absent, assumed = _read_entries(file, content, scale, axes, inverse, masks)
-    assumed += ordered
+    assumed += ordered + mixed_linear({entry.path: entry.header for entry in entries}, file)
     beside = [] if depth in (None, "off") else [file.parent / depth]
     units = {key: content[key] for key in (_UNIT, "depth_scale") if content.get(key) is not None}
     content = {key: value for key, value in content.items() if key != _UNIT}
@@ -409,7 +410,8 @@ def _read_entries(
         if count > 1:
             raise mismatch(f"{file}: frames", "each image once", f"{name} twice", "remove one")
     if axes is None:
-        check_directions([e.camera.camera_to_world for e in entries], str(file), inverse=inverse)
+        poses = [e.camera.camera_to_world for e in entries]
+        assumed += check_directions(poses, str(file), inverse=inverse)
     listed = {_name_of(file.parent, frame.get("file_path"), f"{file}: frames") for frame in content["frames"]}
     return entries, listed - {*names}, assumed
 
@@ -499,7 +501,8 @@ def _listed(file: Path, content: dict, key: str, entries: list[ImageEntry], abse
     for name in sorted(names):
         if len(found[name]) != 1:
             like = f", which is {' or '.join(found[name][:2])}; write the whole path" if found[name] else ""
-            raise mismatch(where, "paths of frames", short(name) + like)
+            advice = "" if like else "remove it from the list, or add its frame"
+            raise mismatch(where, "paths of frames", short(name) + like, advice)
     return {frame for (frame,) in found.values()}
 
 

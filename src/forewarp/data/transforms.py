@@ -36,7 +36,7 @@ from forewarp.data.files import (
     one_of,
     side_files,
 )
-from forewarp.data.images import TURN, Header, by, exif_turned, inspect_image, mixed_linear
+from forewarp.data.images import TURN, Header, by, exif_turned, inspect_image
 from forewarp.data.names import LEAST_SPAN, in_order, read_names, refuse_far
 from forewarp.ops.backend import is_number
 from forewarp.scene.camera import Camera, Lens
@@ -141,7 +141,6 @@ def read_frames(
     bare = [path for entry, path in there if Path(entry.get("file_path")).suffix not in SUFFIXES]
     assumed += beside_images(bare, f"{file}: file_path", "write the one that is meant, or remove the others")
     assumed += unread + exif_turned([image.path for image in images if image.header.is_turned], file)
-    assumed += mixed_linear({image.path: image.header for image in images}, file)
     assumed += _beyond_model(image.entry for image in images)
     keys = [] if any("time" in entry.own for entry in entries) else _TIMES
     like_times = [key for key in keys if all(type(entry.own.get(key)) in (int, float) for entry in entries)]
@@ -352,6 +351,14 @@ def _focal(entry: Entry, width: int, height: int, longer: bool) -> float:
     stands alone, ``camera_angle_y``; a frame's own number wins over one at the top.
     """
     least, most = 0.01 * width, 100 * width
+    angle, of_all = entry.own.get("camera_angle_y"), [key for key in _FOCAL if key in entry.common]
+    is_zoom = of_all and not any(key in entry.own for key in _FOCAL)
+    if is_zoom and is_number(angle) and 0 < angle < math.pi:
+        focals = [entry.common.get(key) for key in ("fl_x", "fl_y")]
+        ratio = focals[0] / focals[1] if all(is_number(f) and f > 0 for f in focals) else 1.0
+        focal = ratio * 0.5 * height / math.tan(0.5 * angle)
+        usual = _focal(replace(entry, own={}), width, height, longer)
+        return focal if abs(focal / usual - 1) > _SAME_ZOOM else usual
     named = next((key for key in ("fl_x", "fl_y") if entry.get(key) is not None), None)
     across = "camera_angle_x" if entry.get("camera_angle_x") is not None or named else "camera_angle_y"
     angle = entry.get(across)
