@@ -259,7 +259,7 @@ def _from_folder(folder: Path, source: Source, step: Step) -> dict:
     assumed = f"{where}: times are even, in the order of the images' names"
     read = read_names(names, str(where), source.name_pattern, one_camera=not as_stored)
     if read is not None and (as_stored or len({*read.frames}) == len(paths)):
-        numbers, assumed = dict(zip(paths, read.times)), f"{where}: times: {read.told}"
+        numbers, assumed = dict(zip(paths, read.times)), f"{where}: times: {read.how}"
         paths.sort(key=numbers.get)
     has_alpha = common_header(paths, one_size=not as_stored).has_alpha
     widths, originals, sizes, times, first, brightest = [], {}, {}, {}, None, 0

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime, timezone
 from functools import partial
-from itertools import accumulate
+from itertools import accumulate, pairwise
 from statistics import median
 from typing import NamedTuple
 
@@ -19,10 +19,10 @@ from forewarp.data.files import SceneError, mismatch
 
 KEY = "set data.name_pattern (of forewarp-capture: name_pattern) to a regular expression with a group"
 KEY += " 'frame' or 'time', or 'year', 'month', 'day', and 'camera' for a rig"
-# A number in a name; between zero bytes stands one that several parts of a name say together.
+# A number in a name; or what several of its parts say together, marked by a zero byte on both sides.
 _NUMBER = "(\0[^\0]+\0|\\d+)"
 _DECIMAL = "(\0[^\0]+\0|(?<!\\d)\\d\\d\\.\\d{3}(?!\\.?\\d)|(?<![\\d.])\\d+(?:\\.\\d+)?(?!\\.?\\d))"
-# Seconds, as of TUM's data or ROS, are Unix time, or fill the name to the microsecond.
+# Seconds with a fraction: Unix time, as of TUM's data or ROS; or a whole name with 6 or 9 digits of it.
 _STAMP = re.compile(r"(?<![\d\0])\d{9,10}\.\d+|(?<![^/])\d+\.(?:\d{6}|\d{9})(?=$|\.[A-Za-z])")
 _STOPWATCH = re.compile(r"(?<!\d)(\d\d?)h(\d\d)m(\d\d)s(\d{3})?(?!\d)")  # as media players write it
 _SECONDS_NANOSECONDS = re.compile(r"(?<!\d)(\d{9,10})[_-](\d{9})(?!\d)")
@@ -46,22 +46,27 @@ def _date(order: str, behind: str, between: str = r"[-_.]|(?<=\d\d)") -> re.Patt
 _TIME_OF_DAY, _COUNTER = "times of day", "a counter"
 _WITH_TIME = rf"(?: at |,? |[-_T.])?{_PACKED}", rf"(?: at |,? |[-_T.]){_APART}"
 _DATED = [_date("Ymd", behind) for behind in _WITH_TIME]  # which nothing else can be
+# Words before a number that say what it counts.
 _FRAME_WORD = re.compile(r"(?i)(?:^|[^a-z])(frame|time|t)[_-]?$")
 _CAMERA_WORD = re.compile(r"(?i)(?:^|[^a-z])(cam|camera|view|sensor|c|v)[_( -]*$")
-_LETTER_WORD = re.compile(r"(?i)(?:^|[^a-z])[cv][_( -]*$")  # before two digits at most: C0001 is a clip
-# Before a number: of films that cameras count, or that are cut into parts.
+_LETTER_WORD = re.compile(
+    r"(?i)(?:^|[^a-z])[cv][_( -]*$"
+)  # a camera's before one or two digits; C0001 is a clip
+# Those before the number of a film, as cameras count them, or of a part of one.
 _FILM_WORD = re.compile(
     r"(?i)(?:^|[^a-z])(c|gx|gh|gopr|gp|mvi|dsc|img|vid|mov|dji|clip|part|chapter|take|seg|seq|sequence|shot"
     r"|session|run|trial)[_-]?$"
 )
 _FRAME = re.compile(r"(?i)(?:^|[^a-z])frame[_-]?$")
-_OF_FILM = re.compile(r"(?i)^\.(mp$|m$|mov|mkv|avi|mts|webm)")  # behind it, up to the next number
+_OF_FILM = re.compile(
+    r"(?i)^\.(mp$|m$|mov|mkv|avi|mts|webm)"
+)  # behind a film's number, up to the next number
 _SPLIT_WORD = re.compile(r"(?i)(?:^|/)(train|val|valid|validation|eval|test)\b")
 _OF_TIME = re.compile(r"(?:(\d+)[h:_.-])?(\d{1,2})[m:_.-](\d\d(?:[.,]\d+)?)s?")  # of a group ``time``
 _EXPONENT = re.compile(r"\d\.\d*[eE][-+]?\d")
 _HEXADECIMAL = re.compile(r"[0-9a-f]+|[0-9A-F]+")
 _ODD = 0.2  # share of the names that may have another form than all others, and are then named in the error
-_GAPS = 4  # numbers for one that is there, in a counter with gaps
+_GAPS = 4  # span of a counter with gaps, in numbers that are there, at most
 _ROUNDING = 1e-6  # of steps that are even
 _LEAST_WORDS = 4  # different texts beside the numbers, from which on these may tell nothing
 _FEW = 4  # names below which a plain counter may look like a time by chance
@@ -127,8 +132,8 @@ def _marked(seconds: float | None) -> str | None:
 
 
 def _instant(match: re.Match) -> float | None:
-    """Return the seconds since 1970 of date and time of day, of which two numbers alone need not be of a
-    clock; None where there is no such date.
+    """Return the seconds since 1970 of a date, with the time of day where it has one; None where there is no
+    such date, or too few digits to tell.
     """
     part = match.groupdict()
     is_whole = part["sep"] or len(part["m"]) + len(part["d"]) == 4
@@ -194,13 +199,13 @@ _FORMS: list[tuple[str, re.Pattern, Callable[[re.Match], float | None]]] = [
 
 
 class NameNumbers(NamedTuple):
-    """What names say: ``frames``, a number each, in any unit; ``cameras``, None without a rig; ``told``, how
-    they were read.
+    """What names say: ``frames``, a number each, in any unit; ``cameras``, None without a rig; ``how`` they
+    were read, in words.
     """
 
     frames: list[float]
     cameras: list[str] | None
-    told: str
+    how: str
 
     @property
     def times(self) -> list[float]:
@@ -240,7 +245,7 @@ class _Reading:
     def is_apart(self) -> bool:
         """Whether one camera's frame numbers end before the next one's begin."""
         ends = sorted((min(group), max(group)) for group in self.groups)
-        return all(high < low for (_, high), (low, _) in zip(ends, ends[1:]))
+        return all(high < low for (_, high), (low, _) in pairwise(ends))
 
 
 def read_names(
@@ -305,16 +310,16 @@ def read_names(
     reading = _chosen(rows, places, names[0], where, views, one_camera)
     if reading is None:
         return None
-    frames, told = _unrolled(reading)
+    frames, how = _unrolled(reading)
     if _may_roll(frames):
         readings = f"numbers to {max(frames):.0f}, where a counter began anew, or with a gap"
         raise _two_ways(where, names[0], readings)
     refuse_far(dict(zip(names, frames)), where, "number", f"rename or remove it, or {KEY}")
     _check_groups(reading, names, where, views, any(_camera_word(rows, i) for i in places))
     if len({*frames}) < len(frames):
-        told += "; images of one number share a time"
+        how += "; images of one number share a time"
     cameras = ["".join(camera) for camera in reading.cameras] if len({*reading.cameras}) > 1 else None
-    return NameNumbers(frames, cameras, told)
+    return NameNumbers(frames, cameras, how)
 
 
 def _two_ways(where: str, name: str, readings: str) -> SceneError:
@@ -636,7 +641,7 @@ def _joined_fraction(rows: list[list[str]], place: int, name: str, where: str) -
     if most < 0.5 * unit or not unit or (between <= {*"_-"} and (unit == 10 or (unit == 100 and most < 60))):
         return False
     pairs = sorted({(int(second[0]), int(text)) for second, text in zip(whole, behind)})
-    goes_on = all(a[1] < b[1] for a, b in zip(pairs, pairs[1:])) and pairs[0][0] < pairs[-1][0]
+    goes_on = all(a[1] < b[1] for a, b in pairwise(pairs)) and pairs[0][0] < pairs[-1][0]
     if goes_on and between <= {*"_-"}:
         if unit in (10**3, 10**6, 10**9) and len(pairs) <= _FEW:
             raise _two_ways(where, name, "fractions of the seconds, or a counter")
@@ -691,9 +696,9 @@ def _chosen(
                 values = [None if match is None else read(match) for match in matches]
                 readings |= {} if None in values or len({*values}) == 1 else {what: values}
             times = readings[_survivor(readings, name, where)]
-        keys = [tuple(float(row[i]) for i in order) for row in rows]
-        ranks = {key: float(rank) for rank, key in enumerate(sorted({*keys}))}
-        return _Reading(together, times or [ranks[key] for key in keys], parts)
+        return _Reading(
+            together, times or _ranks([tuple(float(row[i]) for i in order) for row in rows]), parts
+        )
 
     if one_camera:
         order = [i for i in free if i not in named[-1:]] + named[-1:]
@@ -719,8 +724,7 @@ def _chosen(
         if not reading.is_unique:
             return None
         keys = [(tuple(row[i] for i in texts), *(float(row[i]) for i in places)) for row in rows]
-        ranks = {key: float(rank) for rank, key in enumerate(sorted({*keys}))}
-        film = _Reading(together, [ranks[key] for key in keys], [()] * len(rows))
+        film = _Reading(together, _ranks(keys), [()] * len(rows))
         is_shared = len({*reading.frames}) < len(rows) and film.is_unique
         is_film = is_shared and views is not None and _path(reading, film, views) == "film"
         if is_film and not _returns(reading, views):
@@ -746,6 +750,12 @@ def _chosen(
         return of_film(free, must_tell=True)
     readings = [f"{one.what} ({len({*one.frames})} times)" for one in (*rigs, film)]
     raise _two_ways(where, name, ", or ".join(readings))
+
+
+def _ranks(keys: Sequence[tuple]) -> list[float]:
+    """Return the place of each key in the order of all that differ."""
+    rank = {key: float(place) for place, key in enumerate(sorted({*keys}))}
+    return [rank[key] for key in keys]
 
 
 def _is_clock(digits: Sequence[str]) -> bool:
@@ -783,10 +793,10 @@ def _ranked(
     are_clocks = all(
         ("." in row[i] or len(row[i]) == 2) and float(row[i]) < 60 for row in rows for i in places
     )
-    if all(a < b for a, b in zip(last, last[1:])) and (not are_clocks or not may_carry):
+    if all(a < b for a, b in pairwise(last)) and (not are_clocks or not may_carry):
         return [key[-1] for key in keys]
     joined, unit = dict(zip(ordered, ordered)), 1.0
-    for part, place in list(zip(places, places[1:]))[::-1] if may_carry else ():  # minutes and seconds
+    for part, place in [*pairwise(places)][::-1] if may_carry else ():  # minutes and seconds
         if _tells_film(rows, part):
             break
         widths = {len(row[place]) for row in rows}
@@ -795,11 +805,11 @@ def _ranked(
         if base is None:
             break
         values = sorted({*joined.values()})
-        meets = {(a[-1], b[-1]) for a, b in zip(values, values[1:]) if a[:-1] != b[:-1]}
+        meets = {(a[-1], b[-1]) for a, b in pairwise(values) if a[:-1] != b[:-1]}
         base -= meets == {(base - 1, 1.0)} and base > 60  # counters that begin at 1
         joined = {key: (*part[:-2], part[-2] * base + part[-1]) for key, part in joined.items()}
         unit = base
-    pairs = list(zip(joined.values(), list(joined.values())[1:]))
+    pairs = [*pairwise(joined.values())]
     steps = [b[-1] - a[-1] if a[:-1] == b[:-1] else None for a, b in pairs]
     usual = median([step for step in steps if step is not None] or [1.0])
     meets = [(a[:-1], b) for (a, b), step in zip(pairs, steps) if step is None]
@@ -817,7 +827,7 @@ def _carries(parts: Sequence[tuple[float, ...]], base: float) -> bool:
     """Tell whether the last of several numbers goes on at 0 where it comes to ``base`` and the one before it
     grows by 1, as seconds and minutes do.
     """
-    pairs = list(zip(parts, parts[1:]))
+    pairs = [*pairwise(parts)]
     within = [b[-1] - a[-1] for a, b in pairs if a[:-1] == b[:-1]]
     meets = [(a[-1], b[-1]) for a, b in pairs if a[:-2] == b[:-2] and b[-2] - a[-2] == 1]
     if not within or not meets or any(part[-1] >= base for part in parts):
@@ -835,7 +845,7 @@ def _path(rig: _Reading, film: _Reading, views: Sequence[Sequence[float]]) -> st
     order = np.argsort(film.frames, kind="stable")
     steps = np.linalg.norm(np.diff(np.asarray(views, np.float64)[order], axis=0), axis=-1)
     cameras = [rig.cameras[i] for i in order]
-    meets = [a != b for a, b in zip(cameras, cameras[1:])]
+    meets = [a != b for a, b in pairwise(cameras)]
     within = [step for step, meet in zip(steps, meets) if not meet]
     across = [step for step, meet in zip(steps, meets) if meet]
     extent = float(np.ptp(np.asarray(views, np.float64), axis=0).max())
@@ -856,19 +866,18 @@ def _returns(rig: _Reading, views: Sequence[Sequence[float]]) -> bool:
 
 def _unrolled(reading: _Reading) -> tuple[list[float], str]:
     """Continue a counter that began anew after its last number, as 9999; also say what was read."""
-    frames, told = reading.frames, f"{reading.what}, {min(reading.frames):.10g} to {max(reading.frames):.10g}"
-    highest, lowest = max(frames), min(frames)
+    frames, highest, lowest = reading.frames, max(reading.frames), min(reading.frames)
     turn = 10 ** min(len(f"{highest:.0f}"), _MOST_DIGITS)
     numbers = sorted({*frames})
-    gap, after = max(((b - a, b) for a, b in zip(numbers, numbers[1:])), default=(0, 0))
+    gap, after = max(((b - a, b) for a, b in pairwise(numbers)), default=(0, 0))
     ends = sum(number >= 0.99 * turn for number in numbers), sum(number <= 0.01 * turn for number in numbers)
     rolls = turn >= 10**_COUNTER_DIGITS and min(ends) > 1
     if not rolls or gap < 0.5 * turn or highest % 1 or lowest % 1:
-        return frames, told
+        return frames, f"{reading.what}, {lowest:.10g} to {highest:.10g}"
     skips = int(lowest > 0)  # counters that begin at 1
     frames = [frame if frame >= after else frame + turn - skips for frame in frames]
-    told = f"{reading.what}: {after:g} to {highest:g}, then {lowest:g} on, taken as a counter that began anew"
-    return frames, told
+    how = f"{reading.what}: {after:g} to {highest:g}, then {lowest:g} on, taken as a counter that began anew"
+    return frames, how
 
 
 def _may_roll(frames: Sequence[float]) -> bool:
@@ -903,7 +912,7 @@ def _leap(groups: Sequence[set[float]]) -> bool:
     """Tell whether each camera's numbers are dense, and none goes on where another ends."""
     ends = sorted((min(group), max(group), len(group)) for group in groups)
     step = max((high - low) / (count - 1) for low, high, count in ends)
-    return all(low - high > _CARRY * step for (_, high, _), (low, _, _) in zip(ends, ends[1:]))
+    return all(low - high > _CARRY * step for (_, high, _), (low, _, _) in pairwise(ends))
 
 
 def _check_groups(
@@ -941,7 +950,7 @@ def _check_groups(
         if len(group) == 1 and max(map(len, groups)) > _ODD_ALONE and not _SPLIT_WORD.search(first[camera]):
             expected = f"names of one form, as '{next(n for n in names if n != first[camera])}'"
             raise mismatch(where, expected, f"'{first[camera]}'", f"rename or remove it, or {KEY}")
-    step = min(b - a for a, b in zip(everything, everything[1:]))
+    step = min(b - a for a, b in pairwise(everything))
     for group, camera in zip(groups, dict.fromkeys(reading.cameras)):
         span = max(group) - min(group)
         is_dense = span < whole and span == step * (len(group) - 1) and _SPLIT_WORD.search(first[camera])

@@ -619,7 +619,7 @@ def times_of(
         order, last = in_order(range(len(names)), lambda i: names[i]), max(len(names) - 1, 1)
         line = f"{where}: {why}: spread evenly in the order of the images' names"
         return [rank / last for rank in np.argsort(order).tolist()], line
-    return read.times, f"{where}: {why}: {read.told}"
+    return read.times, f"{where}: {why}: {read.how}"
 
 
 def _odd_time(names: Sequence[str], times: Sequence[float]) -> str:
