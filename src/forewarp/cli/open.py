@@ -35,10 +35,10 @@ from typing import NamedTuple
 from forewarp.cli.capture import capture, is_scan
 from forewarp.cli.entry import command, run_part
 from forewarp.cli.export import export
+from forewarp.cli.prepare import require_viewer
 from forewarp.cli.render import render
 from forewarp.cli.report import report
 from forewarp.cli.train import train
-from forewarp.cli.view import require_viewer
 from forewarp.data.files import mismatch, number, one_of, threads_of
 from forewarp.files import link_of, read_json, write_json
 from forewarp.progress import WholeProgress

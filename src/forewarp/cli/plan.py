@@ -34,26 +34,6 @@ def plan(config) -> None:
     show_plan(make_plan(config, typed_overrides()))
 
 
-def planned():
-    """Make or read a plan of what was typed; return the config of the run that the plan says."""
-    from hydra import compose
-    from hydra.core.hydra_config import HydraConfig
-
-    from forewarp.planning.plan import make_plan
-    from forewarp.planning.plan_file import own_folder, show_plan
-    from forewarp.runs.overrides import key_of, merged, typed_overrides, without_switched_off
-
-    typed, of_job = typed_overrides(of_sweep=True), typed_overrides()
-    keys = [*map(key_of, typed)]
-    if "sweeps" in keys and "model" not in keys:  # the sweep's file may name it
-        of_job = [f"model={HydraConfig.get().runtime.choices['model']}", *of_job]
-    made = make_plan(compose("train", typed), of_job)
-    show_plan(made, to_fit=False)
-    config = compose("train", without_switched_off(merged([*made["overrides"], *own_folder(typed)], typed)))
-    config.planned = made["file"]
-    return config
-
-
 def main() -> None:
     """Run the console script."""
     command("plan", plan, __doc__, config="train")

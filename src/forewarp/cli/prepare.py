@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -15,7 +16,6 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
 from forewarp.cli.mistakes import of_another
-from forewarp.cli.view import require_viewer
 from forewarp.data.files import mismatch, number, one_of, scene_folder, whole
 from forewarp.files import MOST_CONFIG, read_text, replace_file
 from forewarp.outline import check_outline
@@ -29,7 +29,7 @@ from forewarp.runs.config import (
     set_value,
     trust_of,
 )
-from forewarp.runs.overrides import key_of, typed_overrides
+from forewarp.runs.overrides import key_of, merged, typed_overrides, without_switched_off
 
 if TYPE_CHECKING:  # loads torch
     from forewarp.runs.fitted import Score
@@ -128,8 +128,6 @@ def prepare(config: DictConfig) -> Prepared | None:
         return None
     is_planned = config.get("effects") == "auto" and config.get("resume") is None
     if is_planned:
-        from forewarp.cli.plan import planned
-
         config = hashed(planned())
         run = build_run(config)
     measured = bool(config.evaluate) and is_current(run.folder / "metrics.json", run)
@@ -144,6 +142,24 @@ def prepare(config: DictConfig) -> Prepared | None:
     plan = config.get("planned")  # of a stored config it could name any file
     plan = None if plan is None or measured or resumes else read_text(Path(plan), MOST_CONFIG)
     return Prepared(run, config, Score(run, config), measured, viewer, plan)
+
+
+def planned() -> DictConfig:
+    """Make or read a plan of what was typed; return the config of the run that the plan says."""
+    from hydra import compose
+
+    from forewarp.planning.plan import make_plan
+    from forewarp.planning.plan_file import own_folder, show_plan
+
+    typed, of_job = typed_overrides(of_sweep=True), typed_overrides()
+    keys = [*map(key_of, typed)]
+    if "sweeps" in keys and "model" not in keys:  # the sweep's file may name it
+        of_job = [f"model={HydraConfig.get().runtime.choices['model']}", *of_job]
+    made = make_plan(compose("train", typed), of_job)
+    show_plan(made, to_fit=False)
+    config = compose("train", without_switched_off(merged([*made["overrides"], *own_folder(typed)], typed)))
+    config.planned = made["file"]
+    return config
 
 
 def refuse_all(config: DictConfig) -> None:
@@ -249,6 +265,16 @@ def refuse_numbers(config: DictConfig, *keys: str) -> None:
             whole(value, key, LEAST[key])
         else:
             number(value, key, *RANGES[key])
+
+
+def require_viewer() -> None:
+    """Refuse to go on without the package that makes the page.
+
+    Raises:
+        ImportError: naming what to install.
+    """
+    if find_spec("viser") is None:
+        raise ImportError("viewer: expected viser, but got none; install forewarp[viewer]")
 
 
 def viewer_of(config: DictConfig) -> dict | None:

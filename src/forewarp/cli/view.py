@@ -20,7 +20,6 @@ A run in training: forewarp-train ... viewer=true
 
 from __future__ import annotations
 
-from importlib.util import find_spec
 from pathlib import Path
 from signal import SIGINT
 
@@ -30,19 +29,9 @@ from forewarp.interrupts import signal_of
 TOLERANCE = 1e-3  # by which two runs' test cameras may differ, of their distance to the origin
 
 
-def require_viewer() -> None:
-    """Refuse to go on without the package that makes the page.
-
-    Raises:
-        ImportError: naming what to install.
-    """
-    if find_spec("viser") is None:
-        raise ImportError("viewer: expected viser, but got none; install forewarp[viewer]")
-
-
 def view(config) -> None:
     """Load one or two runs and serve their page until Ctrl-C."""
-    from forewarp.cli.prepare import refuse_numbers
+    from forewarp.cli.prepare import refuse_numbers, require_viewer
     from forewarp.runs.config import saved_config
 
     require_viewer()

@@ -11,18 +11,16 @@ from dataclasses import replace
 from functools import partial
 from itertools import count
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from forewarp.drawing.images import write_video
+from forewarp.scene.cloud import Ellipsoids
 from forewarp.viewer.queue import Cancelled, FrameRate, FrameRateControl
 from forewarp.viewer.rendering import Viewer, ViewState, vertical_fov
-
-if TYPE_CHECKING:
-    from forewarp.viewer.page import Page
 
 MIN_INTERVAL = 1 / 30  # seconds between two images while time plays
 REST_SECONDS = 0.15  # without a change, after which the camera is at rest
@@ -31,6 +29,31 @@ _SPRING = 0.55  # of a lean is left from image to image
 VIDEO_FPS = 25.0
 WIDEST = 4  # columns of an image for each row of the largest
 MIN_VIDEO_SECONDS, MAX_VIDEO_SECONDS = 0.1, 600.0
+
+
+class Display(Protocol):
+    """What a session shows its images on, as a browser's page."""
+
+    def canvas(self) -> tuple[int, int]:
+        """Return width and height of the place of the image, in pixels."""
+
+    def show_image(self, image: Tensor, *, rest: bool) -> None:
+        """Show an image (H, W, 3) in [0, 1], stretched over the canvas; ``rest``: it is the full one."""
+
+    def show_splats(self, ellipsoids: Ellipsoids) -> None:
+        """Draw Gaussians in the place of an image."""
+
+    def tell(self, text: str) -> None:
+        """Say how fast images come, or what is going on."""
+
+    def show_time(self, time: float) -> None:
+        """Show the time in [0, 1]."""
+
+    def show_playing(self, playing: bool) -> None:
+        """Show whether time plays."""
+
+    def let_go(self) -> None:
+        """Bring the camera that leans the view back to where it leans nothing."""
 
 
 class Session:
@@ -42,11 +65,11 @@ class Session:
 
     Args:
         viewer: what is seen.
-        page: where it is shown.
+        page: where it is shown, and how large.
         clock: gives seconds.
     """
 
-    def __init__(self, viewer: Viewer, page: Page, clock: Callable[[], float] = time.perf_counter) -> None:
+    def __init__(self, viewer: Viewer, page: Display, clock: Callable[[], float] = time.perf_counter) -> None:
         self.viewer, self.page, self._clock = viewer, page, clock
         self.state, self._leant = ViewState.first(viewer.scene), 0.0
         if viewer.film is not None:

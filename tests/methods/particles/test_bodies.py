@@ -155,7 +155,7 @@ def test_curves_take_over_where_bodies_are(nodes, kind):
     times = [0.1, 0.48, 0.77]
     before = [places(nodes, time) for time in times]
     assert nodes.led
-    nodes.bodies.hand_over(nodes)
+    nodes.take_over()
     assert not nodes.led
     for time, place in zip(times, before):
         assert (places(nodes, time) - place).norm(dim=-1).amax() < 0.02

@@ -9,17 +9,13 @@ from __future__ import annotations
 
 from bisect import bisect_left
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor, nn
 
-if TYPE_CHECKING:
-    from forewarp.methods.particles.nodes import Nodes
-
 _LEAST = 1e-15
-_LOOSE = 1e-4  # how much curves are kept small where they are handed over
 _TOUCHES = 0.05  # share of images in which a body touches the ground
 _STEADY = 0.97  # of its distance that a body keeps, whatever is seen below it: masks are not exact
 
@@ -197,27 +193,6 @@ class Bodies(nn.Module):
         self.sizes.mul_(times)
         gone = self.eyes + times[:, None, None] * (self.middles - self.eyes)
         self.middles.copy_(torch.where(self.seen[:, None], gone, self.rest[:, None]))
-
-    @torch.no_grad()
-    def hand_over(self, nodes: Nodes) -> None:
-        """Let the curves of nodes take over from the poses, by least squares; they may bend bodies."""
-        own, motion = self.of_node >= 0, []
-        for time in self.times:
-            now = nodes.positions.new_zeros(len(own), 7)
-            self.carry(self.at(time), nodes.positions, now, nodes.positions.new_zeros(len(own), 12))
-            now[:, 6] += 1.0
-            if motion:  # q and -q turn alike; curves must not change sides
-                now[(now[:, 3:] * motion[-1][:, 3:]).sum(-1) < 0, 3:] *= -1
-            motion.append(now)
-        motion = torch.stack(motion, 1)[own].double()
-        motion[motion[:, self.row(nodes.curve.canonical_time), 6] < 0, :, 3:] *= -1  # at rest it is 1
-        motion[..., 6] -= 1.0
-        bases = torch.stack([nodes.basis(time) for time in self.times]).double()
-        normal = bases.T @ bases + _LOOSE * torch.eye(bases.shape[1]).to(bases)
-        curves = torch.linalg.solve(normal, bases.T @ motion).float()
-        nodes.translations.data[own], nodes.rotations.data[own] = curves[..., :3], curves[..., 3:]
-        nodes.seen_times.copy_(nodes.seen_times.new_tensor([0.0, 1.0]))
-        self.lead.fill_(False)
 
 
 def _vectors(turns: Tensor) -> Tensor:

@@ -430,7 +430,7 @@ class Particles(Method):
         self.progress, stage = progress, self.stage
         if self.nodes is not None and self.nodes.led and progress >= stage.bodies:
             put_on_ground(self)
-            self.nodes.bodies.hand_over(self.nodes)
+            self.nodes.take_over()
         density.bound_opacity(self)
         for group in optimizer.param_groups:
             if group["name"] in ("means", "node_translations", "node_bodies"):
@@ -488,7 +488,7 @@ class Particles(Method):
         if nodes is not None:
             if nodes.led:
                 nodes = copy.deepcopy(nodes)
-                nodes.bodies.hand_over(nodes)
+                nodes.take_over()
             offsets = nodes.time_offsets
             times = [] if offsets is None else offsets.times
             curves = nodes.translations.data, _data(nodes.rotations), nodes.curve

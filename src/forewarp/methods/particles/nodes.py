@@ -23,6 +23,7 @@ _BEYOND = _FARTHEST + 2 * _HALF_STEP  # of all time, by which a curve must reach
 _REST = 3e-3  # share of a unit below which nodes are pulled to rest with less than full force
 _REST_TIMES = 16  # over which a node's mean place is taken
 _FEWEST = 20  # nodes of a body
+_LOOSE = 1e-4  # how much curves are kept small where they take over from bodies
 _PULL = 0.1  # of the learning rate: by how much a step draws an offset towards 0
 
 
@@ -142,6 +143,27 @@ class Nodes(nn.Module):
     def led(self) -> bool:
         """Whether bodies lead their nodes, and nothing else moves."""
         return self.bodies is not None and bool(self.bodies.lead)
+
+    @torch.no_grad()
+    def take_over(self) -> None:
+        """Fit the curves of nodes to the poses of bodies, by least squares; from then on they lead."""
+        bodies, own, motion = self.bodies, self.bodies.of_node >= 0, []
+        for time in bodies.times:
+            now = self.positions.new_zeros(len(own), 7)
+            bodies.carry(bodies.at(time), self.positions, now, self.positions.new_zeros(len(own), 12))
+            now[:, 6] += 1.0
+            if motion:  # q and -q turn alike; curves must not change sides
+                now[(now[:, 3:] * motion[-1][:, 3:]).sum(-1) < 0, 3:] *= -1
+            motion.append(now)
+        motion = torch.stack(motion, 1)[own].double()
+        motion[motion[:, bodies.row(self.curve.canonical_time), 6] < 0, :, 3:] *= -1  # at rest it is 1
+        motion[..., 6] -= 1.0
+        bases = torch.stack([self.basis(time) for time in bodies.times]).double()
+        normal = bases.T @ bases + _LOOSE * torch.eye(bases.shape[1]).to(bases)
+        curves = torch.linalg.solve(normal, bases.T @ motion).float()
+        self.translations.data[own], self.rotations.data[own] = curves[..., :3], curves[..., 3:]
+        self.seen_times.copy_(self.seen_times.new_tensor([0.0, 1.0]))
+        bodies.lead.fill_(False)
 
     def links(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """Return the nodes that points (N, 3) follow: rows (N, L) int32, and their shares (N, L).
