@@ -108,6 +108,30 @@ def test_the_command_line_wins_over_the_preset_and_the_experiment(order):
     assert "SphericalHarmonics" in config.model.view_dependence._target_
 
 
+FORWARD = ["model=forward", "experiment=dnerf"]
+
+
+@pytest.mark.parametrize(
+    ("words", "handed"),
+    [
+        (FORWARD, True),
+        ([*FORWARD, "start_motion=own"], False),
+        ([*FORWARD, "preset=faithful"], False),
+        ([*FORWARD, "preset=faithful", "start_motion=particles"], True),
+        ([*FORWARD, "ablation=no_tv"], False),  # whose coarse stage is that of the tables
+        ([*FORWARD, "sweeps=effects", "ablation=base"], False),
+        ([*FORWARD, "sweeps=price_list_forward"], False),
+        (["model=backward", "experiment=dnerf"], False),
+        (["model=forward", "experiment=lego_complete"], False),
+    ],
+)
+def test_motion_begins_as_that_of_particles_where_that_was_found_better(words, handed):
+    config = composed("data.scene=x", *words)
+    assert list(config.stage) == ["coarse", "fine"]
+    assert ("model" in config.stage.coarse, config.stage.fine.start == "matter") == (handed, handed)
+    assert (config.preset.coefficients == "nodes") == handed
+
+
 def test_budget_is_shared_out_and_every_weight_may_be_typed():
     weights = ["objective.coarse.weights.tv_depth=0.5", "objective.fine.weights.flow_l1=0.25"]
     stages = run_of("model=forward", "budget.minutes=20", "budget.iterations=1000", *weights).stages

@@ -210,6 +210,20 @@ def test_an_option_of_another_method_names_it(refused, in_tmp, arguments, model,
     assert list(in_tmp.iterdir()) == []
 
 
+@pytest.mark.slow
+def test_how_motion_begins_is_own_or_of_particles(refused, in_tmp):
+    words = "train", "experiment=dnerf", "data.scene=x"
+    expected = "start_motion: expected own or particles, but got 'forward_demo'"
+    assert refused(*words, "model=forward", "start_motion=forward_demo") == expected
+    for model in ("backward", "nerf", "particles"):
+        line = refused(*words, f"model={model}", "start_motion=particles")
+        assert line.startswith(f"start_motion=particles: expected an option of model={model}, but")
+    key = "stage.coarse.hull_frames"
+    line = refused(*words, "model=forward", f"{key}=3")
+    assert line.startswith(f"{key}: expected a key of a run that begins with the motion of particles, but")
+    assert line.endswith("; add start_motion=own")
+
+
 @pytest.mark.parametrize(("name", "key"), [("evaluate", "run"), ("train", "resume")])
 def test_a_bare_folder_is_a_run(refused, in_tmp, name, key):
     (in_tmp / "demo").mkdir()

@@ -151,6 +151,10 @@ def unknown_key(error: Exception, name: str, arguments: list[str]) -> str | None
     keys = list(_every_key(config))
     if key in keys and {"--multirun", "-m"} & set(arguments):
         return f"{key}: expected an option of every job, but got one that not all have; leave it out"
+    of_own = [*(one for one in others if key_of(one) != "start_motion"), "start_motion=own"]
+    if name == "train" and key in _every_key(_composed(name, of_own)):
+        expected = "expected a key of a run that begins with the motion of particles, but got one of its own"
+        return f"{key}: {expected}; add start_motion=own"
     if key in _every_key(_composed(name, [one for one in others if key_of(one) in ("model", "preset")])):
         removed = "expected an option, but got one that another one typed here removes"
         return f"{key}: {removed}; leave one of them out"

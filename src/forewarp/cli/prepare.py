@@ -238,12 +238,18 @@ def refuse_other_methods(config: DictConfig) -> None:
     Effects of voxels are classes, those of particles numbers and words; particles see no single rays.
     """
     target, model = str(config.model.get("_target_")), config.model.name
-    if not (HydraConfig.initialized() and target.startswith((VOXELS, PARTICLES))):
+    if not HydraConfig.initialized():
         return
-    voxels, begins = target.startswith(VOXELS), HydraConfig.get().runtime.choices.get("start_motion")
-    if begins not in (None, "null") and model != "forward":
-        raise ValueError(of_another(f"start_motion={begins}", model, "forward"))
-    for group, option in HydraConfig.get().runtime.choices.items():
+    choices = HydraConfig.get().runtime.choices
+    begins, of_preset = choices.get("start_motion"), f"{choices.get('model')}_{choices.get('preset')}"
+    if begins not in (None, of_preset):  # which an experiment chooses for every method, and few have
+        one_of(begins, "start_motion", "own", "particles")
+    if begins == "particles" and model != "forward":
+        raise ValueError(of_another("start_motion=particles", model, "forward"))
+    if not target.startswith((VOXELS, PARTICLES)):
+        return
+    voxels = target.startswith(VOXELS)
+    for group, option in choices.items():
         own = group.startswith("model/") and "@" not in group  # else of a stage's own model
         part = config.model._get_node(group[6:]) if own else None
         if part is not None and not part._is_none() and isinstance(part, DictConfig) != voxels:

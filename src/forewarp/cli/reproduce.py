@@ -350,7 +350,8 @@ def gpu(keys: Keys) -> Job:
     """Time steps and frames, and PSNR against seconds, of the paper's method on a GPU."""
     lane, folder = [], "runs/bench-gpu"
     for scene in words(keys.scenes or "jumpingjacks hook") if keys.data else ["vehicle"]:
-        base = ["model=forward", f"trainer={keys.device}", *keys.chosen(scene), "+variant.name=base"]
+        base = ["model=forward", "start_motion=own", f"trainer={keys.device}", *keys.chosen(scene)]
+        base += ["+variant.name=base"]
         fast = ["preset=fast", "data.held_out=8", *_until(keys.minutes or "10"), f"run={folder}/{scene}-fast"]
         faithful = ["preset=faithful", *_until(steps="240"), f"run={folder}/{scene}-faithful"]
         lane += [merged([*base, *half], TINY if keys.small else []) for half in (fast, faithful)]
