@@ -85,7 +85,7 @@ def test_the_other_background_is_refused_and_alpha_lies_over_the_right_one(data,
     [
         (lambda path: Image.new("RGB", (12, 12)).save(path, "PNG"), "24 x 24 pixels.*12 x 12"),
         (lambda path: Image.new("RGB", (24, 24)).save(path, "JPEG"), "a PNG of 8 bits.*JPEG"),
-        (lambda path: Image.new("I;16", (24, 24)).save(path, "PNG"), "a PNG of 8 bits.*I;16"),
+        (lambda path: Image.new("I;16", (24, 24)).save(path, "PNG"), "a PNG of 8 bits.*mode I"),
         (lambda path: path.write_text("no"), "a PNG image, but got another file"),
     ],
 )
