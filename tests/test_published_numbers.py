@@ -269,7 +269,7 @@ def test_the_papers_method_names_what_it_does_otherwise():
     assert faithful == [added, *common]
     literal = "objective.fine.literal=[photo,point_color,background_entropy]"
     assert of("preset=faithful", literal) == [added, *common[1:]]
-    fast = of("preset=fast", stage="coarse")
+    fast = of("preset=fast", "start_motion=own", stage="coarse")
     assert sorted(fast) == sorted(["no up-sampling", "no inpainter", *common, *ours])
     assert sorted(of("preset=fast", "ablation=full")) == sorted([added, *common, *ours])
     assert "colour without direction" in of("preset=fast", "ablation=no_view")

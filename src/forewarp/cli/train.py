@@ -19,8 +19,8 @@ What one types most (beside options such as --multirun or --config-dir=FOLDER):
   model=nerf|tnerf|dnerf|nerfies|hypernerf   networks along rays, as in their papers with preset=faithful
   model=ndvg|tineuvox_s|tineuvox_b    voxel grids with networks, as in their papers with preset=faithful
   model=neural_volumes                a volume decoded from pictures of the instant
-  start_motion=own|particles          of model=forward: its voxels find the motion themselves, or a short stage
-                                      of particles finds it first (with preset=fast on dataset=dnerf the default)
+  start_motion=own|particles          of model=forward: its voxels find the motion themselves, or a stage
+                                      of particles finds it first (default of preset=fast dataset=dnerf)
   model/view_dependence=none|harmonics     switch an effect; all others work alike (of forward: none|sh|mlp)
   stage.NAME.lr.GROUP=RATE            a learning rate; groups: means, scales, colors, ... (see --cfg job)
   seed=N                              of all random numbers
