@@ -49,18 +49,16 @@ _DATED = [_date("Ymd", behind) for behind in _WITH_TIME]  # which nothing else c
 # Words before a number that say what it counts.
 _FRAME_WORD = re.compile(r"(?i)(?:^|[^a-z])(frame|time|t)[_-]?$")
 _CAMERA_WORD = re.compile(r"(?i)(?:^|[^a-z])(cam|camera|view|sensor|c|v)[_( -]*$")
-_LETTER_WORD = re.compile(
-    r"(?i)(?:^|[^a-z])[cv][_( -]*$"
-)  # a camera's before one or two digits; C0001 is a clip
+# A camera's, before one or two digits; C0001 is a clip.
+_LETTER_WORD = re.compile(r"(?i)(?:^|[^a-z])[cv][_( -]*$")
 # Those before the number of a film, as cameras count them, or of a part of one.
 _FILM_WORD = re.compile(
     r"(?i)(?:^|[^a-z])(c|gx|gh|gopr|gp|mvi|dsc|img|vid|mov|dji|clip|part|chapter|take|seg|seq|sequence|shot"
     r"|session|run|trial)[_-]?$"
 )
 _FRAME = re.compile(r"(?i)(?:^|[^a-z])frame[_-]?$")
-_OF_FILM = re.compile(
-    r"(?i)^\.(mp$|m$|mov|mkv|avi|mts|webm)"
-)  # behind a film's number, up to the next number
+# Behind a film's number, up to the next number.
+_OF_FILM = re.compile(r"(?i)^\.(mp$|m$|mov|mkv|avi|mts|webm)")
 _SPLIT_WORD = re.compile(r"(?i)(?:^|/)(train|val|valid|validation|eval|test)\b")
 _OF_TIME = re.compile(r"(?:(\d+)[h:_.-])?(\d{1,2})[m:_.-](\d\d(?:[.,]\d+)?)s?")  # of a group ``time``
 _EXPONENT = re.compile(r"\d\.\d*[eE][-+]?\d")
