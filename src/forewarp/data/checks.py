@@ -16,6 +16,7 @@ from forewarp.data.directions import common_point, readings_of
 from forewarp.data.files import SceneError, mismatch
 from forewarp.data.images import by
 from forewarp.data.names import hexadecimal, in_order, read_names
+from forewarp.data.paths import doubt_paths
 from forewarp.scene.box import Box, Lattice
 from forewarp.scene.camera import Camera, focus_point
 from forewarp.scene.frame import Frame, Scene, sightings, spread, walk_of, where_seen
@@ -75,6 +76,7 @@ def remarks(scene: Scene) -> Iterator[str]:
         got, due = next(pair for pair in zip(names, numbered) if pair[0] != pair[1])
         line = f"times follow the images' names as texts, not their numbers ({got} comes where {due} is due)"
         yield f"{line}; count them in the order of the numbers"
+    yield from doubt_paths(scene)
     first, last = scene.times[0], scene.times[-1]
     beyond = [frame.time for frame in scene.test if not first <= frame.time <= last]
     if scene.test and len(beyond) == len(scene.test):
