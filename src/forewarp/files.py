@@ -35,6 +35,8 @@ MOST_ARRAYS = 1 << 30  # of NumPy's files, also when unpacked
 MOST_COMMAND = 1 << 16  # characters of a command, as splitting it takes time that grows by the square
 MOST_LEVELS = 40  # of YAML, one within the other
 
+_POINTER, _MOST_POINTER = b"version https://git-lfs", 1024  # what Git LFS leaves where it has not fetched
+
 _FULL = errno.ENOSPC, errno.EDQUOT, errno.EFBIG  # what a full disk says
 _LEFT = 24 * 3600  # seconds after which nobody fills a folder any more
 _PLAIN_TAGS = {f"tag:yaml.org,2002:{kind}" for kind in ("str", "int", "float", "bool", "null", "map", "seq")}
@@ -407,7 +409,7 @@ def check_size(path: Path, most: int) -> None:
 
     Raises:
         OSError: where there is none, or a folder.
-        ValueError: for a device, a pipe, and a file of more than ``most`` bytes.
+        ValueError: for a device, a pipe, a file of more than ``most`` bytes, and a pointer of Git LFS to one.
     """
     about = path.stat()
     if stat.S_ISDIR(about.st_mode):
@@ -416,6 +418,11 @@ def check_size(path: Path, most: int) -> None:
         raise ValueError(f"{path}: expected a file, but got a device or a pipe")
     if about.st_size > most:
         raise ValueError(f"{path}: expected at most {most} bytes, but got {about.st_size}")
+    if len(_POINTER) <= about.st_size < _MOST_POINTER:
+        with path.open("rb") as stream:
+            if stream.read(len(_POINTER)) == _POINTER:
+                got = "a pointer of Git LFS to it; fetch it with git lfs pull"
+                raise ValueError(f"{path}: expected the file itself, but got {got}")
 
 
 def own_folder() -> Path:

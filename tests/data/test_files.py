@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from forewarp.data import files, hypernerf
-from forewarp.data.arrays import load_numpy
+from forewarp.data.arrays import load_numpy, read_cloud
 from forewarp.data.cameras import box_of, pose_of
 from forewarp.data.files import (
     MOST_BYTES,
@@ -30,6 +30,7 @@ from forewarp.data.files import (
     whole,
 )
 from forewarp.data.images import inspect_image, read_gray16, read_image
+from forewarp.data.video import stamps_of
 from tests.support.written_scenes import refused, write_dnerf, write_rig
 
 BIG, EYE, NAN = 60_000, np.eye(4), float("nan")
@@ -232,6 +233,17 @@ def test_pipes_and_devices_are_no_files(tmp_path):
     (tmp_path / "b.json").symlink_to("/dev/zero")
     for read, name in ((read_bytes, "a.json"), (inspect_image, "a.jpg"), (read_json, "b.json")):
         refused_cheaply(read, tmp_path / name, "expected a file, but got a device or a pipe")
+
+
+@pytest.mark.parametrize("name", ["a.json", "a.npy", "a.ply", "a.obj", "a.png", "a.mp4"])
+def test_pointers_of_git_lfs_are_named(tmp_path, name):
+    mark = "version https://git-lfs.github.com/spec/v1\noid sha256:4d7a\nsize 12345\n"
+    (tmp_path / name).write_text(mark)
+    readers = {"json": read_json, "png": inspect_image, "mp4": stamps_of}
+    read = readers.get(name[2:], lambda path: read_cloud(path, 3))
+    with pytest.raises(ValueError, match=f"{name}: expected the file itself, .* Git LFS.*; .*git lfs pull"):
+        read(tmp_path / name)
+    assert fingerprint(tmp_path)["images"]["count"] + len(fingerprint(tmp_path)["texts"]) == 1
 
 
 @pytest.fixture

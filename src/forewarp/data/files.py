@@ -487,7 +487,7 @@ def fingerprint(folder: Path) -> dict:
     for path in _files(folder):
         name, suffix, size = path.relative_to(folder).as_posix(), path.suffix.lower(), path.stat().st_size
         if suffix in _READ and size <= MOST_BYTES:
-            texts[name] = hashlib.sha256(read_bytes(path)).hexdigest()
+            texts[name] = hashlib.sha256(path.read_bytes()).hexdigest()
         elif suffix in _READ | _LISTED:
             names.append(f"{size} {name}\n")
             sizes.append(size)

@@ -550,8 +550,6 @@ def _kind_of(stream: BinaryIO) -> tuple[str, str]:
     """Say what a file is that is no PNG or JPEG, by its first bytes, and what to do."""
     stream.seek(0)
     head = stream.read(32)
-    if head.startswith(b"version https://git-lfs"):
-        return "a pointer of Git LFS", "fetch the file with git lfs pull"
     for kind, (at, marks) in _OTHER_KINDS.items():
         if head[at:].startswith(marks):
             return kind, "convert it to PNG or JPEG"
