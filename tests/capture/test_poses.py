@@ -81,6 +81,33 @@ def test_a_model_is_found_where_colmap_and_nerfstudio_put_it(tmp_path, place):
     assert read_model(tmp_path).cameras.keys() == cameras.keys()
 
 
+@pytest.mark.parametrize("end", ["\n", "\r\n"])
+def test_names_with_blanks_are_whole(tmp_path, end):
+    cameras = {f"my frame {name}": camera for name, camera in cameras_on_arc(3).items()}
+    write_model(tmp_path / "m", cameras, POINTS)
+    for file in (tmp_path / "m").glob("*.txt"):
+        file.write_bytes(file.read_bytes().replace(b"\n", end.encode()))
+    assert list(read_model(tmp_path / "m").cameras) == list(cameras)
+
+
+@pytest.mark.parametrize("part", [None, "camera", "image", "name"])
+def test_a_binary_and_a_text_model_that_differ_are_refused(tmp_path, part):
+    write_model(tmp_path / "m", cameras_on_arc(3), POINTS)
+    model = pycolmap.Reconstruction(tmp_path / "m")
+    if part == "camera":
+        model.cameras[1].params = model.cameras[1].params * [1.3, 1.3, 1, 1, 1, 1, 1, 1]
+    elif part == "image":
+        model.transform(pycolmap.Sim3d(1.0, pycolmap.Rotation3d(), [0.1, 0, 0]))
+    elif part == "name":
+        model.images[1].name = "b.png"
+    model.write_binary(tmp_path / "m")
+    if part is None:
+        assert len(read_model(tmp_path / "m").cameras) == 3
+        return
+    with pytest.raises(ValueError, match="expected one model, but got cameras.bin, .* differ, of .*; move"):
+        read_model(tmp_path / "m")
+
+
 def test_what_cannot_be_read_is_refused(tmp_path):
     with pytest.raises(ValueError, match="expected a folder with cameras.bin, images.bin and points3D.bin"):
         read_model(tmp_path)

@@ -15,9 +15,9 @@ import torch
 from forewarp.capture.frames import Frames, Progress
 from forewarp.data.cameras import check_lens
 from forewarp.data.directions import inverted, opposite, other_readings
-from forewarp.data.files import SceneError, composed, mismatch
+from forewarp.data.files import SceneError, composed, mismatch, opened
 from forewarp.data.images import by
-from forewarp.files import memory_within
+from forewarp.files import MOST_FILM, memory_within
 from forewarp.scene.camera import Camera, Lens
 
 pycolmap.logging.minloglevel = pycolmap.logging.FATAL.value  # print nothing but what ends it
@@ -51,6 +51,8 @@ _READINGS = {  # what else may be in a model
 }
 _SAME_PLACE = 1e-6  # of the distance from the origin; models have six digits or more
 _ROOM = 1 << 30  # bytes that reading a model may take beside twenty times its files
+_PARTS = "cameras", "images", "points3D"  # files of a model
+_SAME = 1e-3  # share by which two models of the same images may differ; some write six digits
 _PLACES = ("", "sparse/0", "sparse", "colmap/sparse/0")  # of a model in a folder that is given
 Pairs = Sequence[tuple[str, str]]  # of images, by their names
 _PARAMETERS = {"f", "fx", "fy", "cx", "cy", "k", "k1", "k2", "k3", "p1", "p2"}
@@ -158,22 +160,19 @@ def read_model(folder: Path, originals: Mapping[str, str] | None = None) -> Reco
         originals: names of images in the model by those that they are to have; None: they stay.
 
     Raises:
-        ValueError: where there is none, or one that cannot be read, or that has other images.
+        ValueError: where there is none, or one that cannot be read, or that has other images, or both kinds
+            with cameras that differ.
     """
-    parts = [[f"{name}.{kind}" for name in ("cameras", "images", "points3D")] for kind in ("bin", "txt")]
-    places = (folder / place for place in _PLACES)
-    there = [place for place in places if any(all((place / file).is_file() for file in of) for of in parts)]
-    if not there:
+    places = {place: _kinds(place) for place in (folder / place for place in _PLACES)}
+    folder = next((place for place, kinds in places.items() if kinds), folder)
+    if not (kinds := places[folder]):
         expected = "a folder with cameras.bin, images.bin and points3D.bin (or .txt)"
         raise mismatch("colmap", expected, folder, "it is often called sparse/0")
-    folder = there[0]
-    try:
-        most = sum(file.stat().st_size for file in folder.glob("*.*") if file.is_file())
-        with memory_within(_ROOM + 20 * most):  # it believes what a file says of its lengths
-            model = pycolmap.Reconstruction(folder)
-    except (RuntimeError, ValueError, IndexError, OverflowError, MemoryError) as error:
-        text = (str(error).strip().splitlines() or ["a file that cannot be read"])[-1]
-        raise mismatch(folder, "a COLMAP model", text, "export it again") from error
+    model, *others = (_stored(folder, kind) for kind in kinds)
+    for other in others:
+        if (name := _differing(model, other)) is not None:
+            got = f"cameras.bin, images.bin and cameras.txt, images.txt that differ, of {name}"
+            raise mismatch(folder, "one model", got, "move the three files that are not meant elsewhere")
     if originals is None:
         return Reconstruction.of(model)
     ours = {composed(original): name for name, original in originals.items()}
@@ -188,6 +187,49 @@ def read_model(folder: Path, originals: Mapping[str, str] | None = None) -> Reco
     for image in model.images.values():
         image.name = ours.get(image.name, image.name)
     return replace(Reconstruction.of(model, absent), absent=absent)
+
+
+def _kinds(folder: Path) -> list[str]:
+    """List the kinds of model that are whole in a folder, bin before txt."""
+    return [k for k in ("bin", "txt") if all((folder / f"{part}.{k}").is_file() for part in _PARTS)]
+
+
+def _stored(folder: Path, kind: str) -> pycolmap.Reconstruction:
+    """Read a model of a kind; SceneError for one that cannot be read."""
+    files = [folder / f"{part}.{kind}" for part in _PARTS]
+    for file in files:
+        with opened(file, MOST_FILM):
+            pass
+    model = pycolmap.Reconstruction()
+    try:
+        with memory_within(_ROOM + 20 * sum(file.stat().st_size for file in files)):  # it believes lengths
+            (model.read_binary if kind == "bin" else model.read_text)(folder)
+    except (RuntimeError, ValueError, IndexError, OverflowError, MemoryError) as error:
+        text = (str(error).strip().splitlines() or ["a file that cannot be read"])[-1]
+        raise mismatch(folder, "a COLMAP model", text, "export it again") from error
+    if kind == "txt":  # of a name with blanks it took what is before the first
+        with files[1].open(encoding="utf-8", errors="replace") as lines:
+            rows = (line.split(maxsplit=9) for line in lines if line.strip() and line.lstrip()[0] != "#")
+            for row in rows:
+                model.images[int(row[0])].name = row[9].rstrip()
+                next(lines, None)  # its points, or an empty line
+    return model
+
+
+def _differing(model: pycolmap.Reconstruction, other: pycolmap.Reconstruction) -> str | None:
+    """Name the first image whose camera differs in two models, or is in one alone; None where none does."""
+    first, second = ({i.name: _camera(i) for i in m.images.values() if i.has_pose} for m in (model, other))
+    centers = np.stack([np.asarray(camera.center) for camera in first.values()] or [np.zeros(3)])
+    reach = max(float(np.abs(centers - centers.mean(0)).max()), _SAME)
+
+    def is_same(a: Camera, b: Camera) -> bool:
+        inner = [(*c.inner[:6], *(c.lens.k + c.lens.p if c.lens else (0,) * 5)) for c in (a, b)]
+        turned = float((a.camera_to_world - b.camera_to_world)[:3, :3].abs().max())
+        apart = float((a.center - b.center).norm())
+        return np.allclose(*inner, _SAME, _SAME) and turned < _SAME and apart < _SAME * reach
+
+    names = sorted(first.keys() | second.keys())
+    return next((n for n in names if not (n in first and n in second and is_same(first[n], second[n]))), None)
 
 
 @dataclass(frozen=True)
