@@ -417,6 +417,18 @@ def test_masks_at_the_top_are_of_all_frames(tmp_path, masked):
         assert torch.equal(frame.load_moving(), mask)
 
 
+def test_of_masks_those_of_the_scale_are_read_or_else_those_of_full_size(tmp_path, masked):
+    shares = torch.from_numpy(masked()).float().reshape(10, 2, 15, 2).mean((1, 3))
+    for i in range(10):
+        write_image(tmp_path / "toy" / "images_2" / f"frame_{i}.png", np.full((10, 15, 3), 90, np.uint8))
+    for frame in read_scene(tmp_path, "toy", scale=2).train:
+        assert torch.equal(frame.load_valid(), shares >= 0.5)
+    assert read_scene(tmp_path, "toy", scale=2, masks="alpha").train[0].load()[..., 3].sum() == 255 * 24
+    for i in range(10):
+        write_image(tmp_path / "toy" / "masks_2" / f"m_{i}.png", np.full((10, 15), 255 * (i > 0), np.uint8))
+    assert read_scene(tmp_path, "toy", scale=2).train[0].load_valid().all()
+
+
 @pytest.mark.parametrize("brightness", [255, 1, 38])
 def test_masks_of_nerfstudio_tell_where_to_train_and_measure(tmp_path, masked, brightness):
     mask = torch.from_numpy(masked(brightness))

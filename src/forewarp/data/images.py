@@ -360,7 +360,7 @@ class StoredImage:
         size: (width, height), what the files must hold.
         factor: average blocks of so many pixels a side; of a cut-out, at most 2, an odd last row or column is
             cut off.
-        mask: of the same size; what is foreground see ``bright``.
+        mask: of the same or a larger size; what is foreground see ``bright``.
         opaque: leave the image's own alpha aside.
         premultiplied: colours on disk are multiplied by alpha.
     """
@@ -404,7 +404,7 @@ class StoredMask:
 
     Args:
         path: of the mask.
-        size: (width, height), what the file must hold.
+        size: (width, height), to which a larger file is brought.
         of_alpha: it is the alpha of an image.
     """
 
@@ -412,7 +412,7 @@ class StoredMask:
         self.path, self.size, self.of_alpha = path, size, of_alpha
 
     def __call__(self) -> Tensor:
-        """Give the mask; SceneError where it cannot be decoded, has another size or is dark everywhere."""
+        """Give the mask; SceneError where it cannot be decoded or is dark everywhere."""
         if self.is_dark():
             advice = "write what counts as 255 and all else as 0, or set data.masks=off"
             got = "none above 127 of 255, nor labels beside 0"
@@ -420,7 +420,7 @@ class StoredMask:
         return CACHE.get(self, self._decode)
 
     def is_dark(self) -> bool:
-        """Tell whether it is dark everywhere; SceneError where it cannot be decoded or has another size."""
+        """Tell whether it is dark everywhere; SceneError where it cannot be decoded."""
         return not bool(CACHE.get(self, self._decode).any())
 
     def _decode(self) -> Tensor:
@@ -428,46 +428,40 @@ class StoredMask:
 
 
 class MovingMask(StoredMask):
-    """A mask of what moves, bool (H, W), kept as others; it may be dark everywhere.
-
-    The file may be some times as large as ``size``: a pixel moves where half of it does.
-    """
+    """A mask of what moves, bool (H, W), kept as others; it may be dark everywhere."""
 
     def __call__(self) -> Tensor:
         """Give the mask; SceneError where it cannot be decoded."""
         return CACHE.get(self, self._decode)
-
-    def _decode(self) -> Tensor:
-        mask, shape = bright(self.path), self.size[::-1]
-        if mask.shape == shape:
-            return mask
-        return torch.nn.functional.interpolate(mask[None, None].float(), shape, mode="area")[0, 0] >= 0.5
 
 
 def bright(path: Path, size: tuple[int, int] | None = None, of_alpha: bool = False) -> Tensor:
     """Decode what is foreground in a mask, (H, W) bool: where it is above 127; in one with colours, as a
     palette has them for several objects, whatever is not black; in one of small numbers, and in a PNG of few
     levels that fill areas beside 0, as labels do and soft edges don't, whatever is not 0. An alpha
-    counts instead where colours are one, or those of an image that was cut out.
+    counts instead where colours are one, or those of an image that was cut out. Brought to a smaller size, a
+    pixel is foreground where half of it is.
 
     Args:
         path: of the mask.
-        size: (width, height) that it must have; None: any.
+        size: (width, height); None: as stored.
         of_alpha: the mask is the alpha of this image.
 
     Raises:
         SceneError: as ``read_image``.
     """
-    rgba = read_image(path, size)
+    rgba = read_image(path)
     if not of_alpha and bool((rgba[..., 3] < 255).any()):
         colors, inside = rgba[..., :3].reshape(-1, 3), rgba[rgba[..., 3] > _FOREGROUND][:, :3]
         of_alpha = bool((colors == colors[0]).all()) or any(map(_are_of_image, (colors, inside)))
     values = rgba[..., 3] if of_alpha else rgba[..., :3].amax(-1)
     is_colored = not of_alpha and int((values - rgba[..., :3].amin(-1)).max()) >= _COLORED
     is_labels = not of_alpha and path.suffix.lower() == ".png" and _are_labels(values)
-    if is_labels or int(values.max()) <= _NUMBERED:
-        return values > 0
-    return values >= (_COLORED if is_colored else _FOREGROUND + 1)
+    least = 1 if is_labels or int(values.max()) <= _NUMBERED else _COLORED if is_colored else _FOREGROUND + 1
+    mask = values >= least
+    if size in (None, mask.shape[::-1]):
+        return mask
+    return torch.nn.functional.interpolate(mask[None, None].float(), size[::-1], mode="area")[0, 0] >= 0.5
 
 
 def _are_labels(values: Tensor) -> bool:

@@ -356,9 +356,8 @@ def _read_entries(
     entries, has_mask, dark = [], [], []
     for image in images:
         mask, valid, entry, has_alpha = None, None, image.entry, image.header.has_alpha
-        if entry.get("mask_path") is not None and masks != "off":
-            mask = image_of(entry, "mask_path", scale)
-            inspect_image(mask, image.header.size, f" as {image.path.name}")
+        if masks != "off":
+            mask = _mask_of(image, "mask_path", scale)
         if masks == "ignore" and mask is None and not has_alpha:
             expected = "a mask_path or alpha, as data.masks=ignore"
             raise mismatch(image.path, expected, "neither", "set data.masks=null")
@@ -371,8 +370,10 @@ def _read_entries(
         load = StoredImage(image.path, image.header.size, mask=None if valid else mask, opaque=opaque)
         has_mask.append(mask is not None)
         name = _name_of(file.parent, entry.own.get("file_path"), entry.where("file_path"))
-        beside = {f"load_{kind}": _motion(image, f"{kind}_path", scale) for kind in ("moving", "resting")}
-        beside["load_valid"] = valid
+        beside = {"load_valid": valid}
+        for kind in ("moving", "resting"):
+            path = _mask_of(image, f"{kind}_path", scale)
+            beside[f"load_{kind}"] = path and MovingMask(path, image.header.size)
         taken_by = entry.own.get("camera")
         taken_by = int(taken_by) if isinstance(taken_by, float) and taken_by.is_integer() else taken_by
         taken_by = str(taken_by) if type(taken_by) in (str, int) else None  # an object is another program's
@@ -416,19 +417,26 @@ def _read_entries(
     return entries, listed - {*names}, assumed
 
 
-def _motion(image: ListedImage, key: str, scale: int) -> MovingMask | None:
-    """Find the mask of which pixels of an image move or rest; None without such a key.
+def _mask_of(image: ListedImage, key: str, scale: int) -> Path | None:
+    """Find the mask of an image, in a folder of the ``scale`` or else as large as the full-size image; None
+    without such a key.
 
     Raises:
-        SceneError: for a mask that is not as large as the image that is not ``scale`` times smaller.
+        SceneError: for a mask that is not as large.
     """
-    if image.entry.get(key) is None:
+    entry, size = image.entry, image.header.size
+    if entry.get(key) is None:
         return None
-    mask, size = MovingMask(image_of(image.entry, key), image.header.size), image.header.size
-    found = inspect_image(mask.path).size
+    path = image_of(entry, key)
+    is_at_top = path.parent == entry.file.parent
+    small = path if is_at_top else image_of(entry, key, scale)
+    if scale == 1 or not (is_at_top or (path.is_file() and not small.is_file())):
+        inspect_image(small, size, f" as {image.path.name}")
+        return small
+    found = inspect_image(path).size
     if any(abs(n - big / scale) >= 1 for n, big in zip(size, found)):
-        raise mismatch(mask.path, f"{by(scale * n for n in size)} pixels as {image.path.name}", by(found))
-    return mask
+        raise mismatch(path, f"{by(scale * n for n in size)} pixels as {image.path.name}", by(found))
+    return path
 
 
 def _name_of(folder: Path, value: object, where: str) -> str:
