@@ -62,6 +62,7 @@ def test_options_of_every_method_compose_and_instantiate(words):
 GROUPS = [f"model/{effect}" for effect, _ in OFF]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("words", rows_of(*GROUPS, "model/radiance"), ids=" ".join)
 def test_options_of_voxels_compose_and_instantiate(words):
     model = run_of("model=forward", *words).model
@@ -70,6 +71,7 @@ def test_options_of_voxels_compose_and_instantiate(words):
     assert None not in [model.keywords[effect] for effect in chosen]
 
 
+@pytest.mark.slow
 def test_effects_of_particles_are_switched():
     off = run_of(*(f"{group}=none" for group, _ in OF_PARTICLES[1:])).model.keywords
     assert off == dict.fromkeys(group.removeprefix("model/") for group, _ in OF_PARTICLES)
@@ -86,6 +88,7 @@ def test_every_command_has_a_config(name):
     assert OmegaConf.to_container(config, resolve=True, throw_on_missing=True)["paths"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("preset", PRESETS)
 def test_off_is_none_whatever_the_preset(preset):
     off = run_of("model=forward", f"preset={preset}", *(f"model/{effect}=none" for effect, _ in OFF)).model
@@ -93,12 +96,14 @@ def test_off_is_none_whatever_the_preset(preset):
     assert {name.split(".")[0] for name, _ in method_of(off).named_parameters()} == {"radiance"}
 
 
+@pytest.mark.slow
 def test_every_number_of_the_renderer_is_a_key_and_equals_its_default():
     parameters = list(signature(Renderer.__init__).parameters.values())[1:]
     config = composed("data.scene=x", "model=forward", "preset=faithful").model.renderer
     assert config == {"_target_": "forewarp.renderer.Renderer"} | {p.name: p.default for p in parameters}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("order", [1, -1])
 def test_the_command_line_wins_over_the_preset_and_the_experiment(order):
     words = ["experiment=dnerf", "preset=faithful", "data.box=null", "data.rays=7"]
@@ -111,6 +116,7 @@ def test_the_command_line_wins_over_the_preset_and_the_experiment(order):
 FORWARD = ["model=forward", "experiment=dnerf"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("words", "handed"),
     [
@@ -132,6 +138,7 @@ def test_motion_begins_as_that_of_particles_where_that_was_found_better(words, h
     assert (config.preset.coefficients == "nodes") == handed
 
 
+@pytest.mark.slow
 def test_budget_is_shared_out_and_every_weight_may_be_typed():
     weights = ["objective.coarse.weights.tv_depth=0.5", "objective.fine.weights.flow_l1=0.25"]
     stages = run_of("model=forward", "budget.minutes=20", "budget.iterations=1000", *weights).stages
@@ -142,6 +149,7 @@ def test_budget_is_shared_out_and_every_weight_may_be_typed():
     assert set(coarse) == set(ForwardWarp.terms)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("dropped", "left"), [("~stage.fine", "coarse"), ("stage.coarse=null", "fine")])
 def test_the_stage_that_is_left_has_the_whole_budget(dropped, left):
     (only,) = run_of("budget.minutes=20", dropped).stages
@@ -160,6 +168,7 @@ def test_every_stage_key_may_be_typed_and_starts_from_the_same():
             assert ours == expected, field.name
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("data", options("data"))
 def test_every_dataset_takes_a_canonical_time_and_the_presets_background(data):
     config = composed("data.scene=x", "data.canonical=middle", name=f"data/{data}")
@@ -214,6 +223,7 @@ def test_compact_differs_from_faithful_in_sizes_and_ends_alone(model):
     assert compact == faithful
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("model", ["forward", pytest.param("backward", marks=pytest.mark.slow)])
 def test_each_number_of_a_method_is_taken_where_it_is_keyed(model):
     hypernerf = ["experiment=hypernerf", "data.scene=broom2", f"model={model}"]

@@ -62,6 +62,7 @@ def differences(place, content, default=None):
             yield name, value, defaults[key]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", METHODS)
 def test_constructors_have_the_defaults_of_the_faithful_preset(method):
     config = composed("data.scene=x", f"model={method}", "preset=faithful")

@@ -111,6 +111,7 @@ def is_missing(code: str) -> bool:
     return False
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(ROOT).as_posix())
 def test_what_pages_name_exists(page):
     text = page.read_text()

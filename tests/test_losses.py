@@ -101,6 +101,7 @@ def test_losses_of_whole_images():
     assert losses.robust(torch.full((1, 1, 3), 0.75), torch.zeros(1, 1, 3), 1.0).item() == 0.75
 
 
+@pytest.mark.slow
 def test_gradcheck():
     def draw(*shape):
         return (0.1 + 0.8 * torch.rand(*shape, dtype=torch.float64)).requires_grad_()

@@ -54,6 +54,7 @@ def test_nothing_is_written_twice():
     assert {body: files for body, files in homes(bodies).items() if len(files) > 1} == {}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("operation", "home"),
     [
@@ -73,6 +74,7 @@ def test_an_operation_has_one_home(operation, home):
     assert homes(attributes)[operation] == home
 
 
+@pytest.mark.slow
 def test_a_weight_is_compared_with_zero_in_the_objective_only():
     def comparisons(tree):
         for node in ast.walk(tree):
@@ -84,6 +86,7 @@ def test_a_weight_is_compared_with_zero_in_the_objective_only():
     assert homes(comparisons)["weight"] == {"training/objective.py"}
 
 
+@pytest.mark.slow
 def test_effects_are_asked_for_in_the_methods_only():
     def questions(tree):
         for node in ast.walk(tree):

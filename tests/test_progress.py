@@ -74,6 +74,7 @@ def test_parts_share_one_line_with_the_time_left_of_all(monkeypatch):
     assert ProgressLine.whole is None
 
 
+@pytest.mark.slow
 def test_what_takes_long_shows_that_it_moves(capsys):
     stream = Terminal()
     with pytest.MonkeyPatch.context() as patch:

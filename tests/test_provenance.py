@@ -49,6 +49,7 @@ def record(site, name, version="0.1", **files):
     importlib.invalidate_caches()
 
 
+@pytest.mark.slow
 def test_the_commit_is_of_the_packages_own_checkout(site):
     write(site / "theirs_p", __init__="", methods="a = 1")
     write(site, alone_p="a = 1")
@@ -65,6 +66,7 @@ def test_the_commit_is_of_the_packages_own_checkout(site):
     assert not {"theirs_p", "alone_p"} & sys.modules.keys()
 
 
+@pytest.mark.slow
 def test_a_package_without_a_checkout_has_what_was_noted_when_it_was_installed(site):
     for name in ("plain_p", "cloned_p", "named_p"):
         write(site / name, __init__="")

@@ -151,6 +151,7 @@ def test_faithful_has_the_published_numbers(model, scene, published, parameters)
     assert (at_full_size(made, voxels[-1][1]) if voxels else parameter_count(made)) == parameters
 
 
+@pytest.mark.slow
 def test_ndvg_never_sees_the_last_images():
     (coarse, _) = build_run(of_preset("faithful", "ndvg")).stages
     assert coarse.settings.iterations == 5000
@@ -160,6 +161,7 @@ def test_ndvg_never_sees_the_last_images():
     assert in_play == [10, 10, 166]
 
 
+@pytest.mark.slow
 def test_faithful_neural_volumes_has_the_published_numbers():
     config = of_preset("faithful", "neural_volumes")
     asked = {"picture_size": [512, 384], "tower": [64, 64, 128, 128, 256, 256, 256], "code": 256}

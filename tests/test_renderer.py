@@ -103,6 +103,7 @@ def test_no_rays_and_one_sample():
     assert drawn.opacity.item() == pytest.approx(1 - math.exp(-0.5))
 
 
+@pytest.mark.slow
 def test_gradcheck():
     field = cloud()
     values = field.values.clone().requires_grad_()

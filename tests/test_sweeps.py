@@ -84,6 +84,7 @@ def test_every_scene_and_choice_composes_and_has_a_folder_of_its_own():
         assert len({hashed(job_of(sweep, *job)).run for job in jobs}) == len(jobs), sweep
 
 
+@pytest.mark.slow
 def test_effects_are_compared_with_the_preset_with_all_and_with_none():
     jobs = jobs_of("effects")
     assert len(jobs) == 24
@@ -97,6 +98,7 @@ def test_effects_are_compared_with_the_preset_with_all_and_with_none():
     assert None not in [particles.model[effect.name] for effect in EFFECTS]
 
 
+@pytest.mark.slow
 def test_seeds_repeat_every_job():
     once, thrice = ({tuple(sorted(job)) for job in jobs_of("nhr", f"seeds={n}")} for n in (1, 3))
     again = [{tuple(word.replace("seed=0", f"seed={n}") for word in job) for job in once} for n in range(3)]
@@ -117,6 +119,7 @@ def test_a_typed_scene_takes_the_place_of_those_of_a_sweep(ok, in_tmp):
         assert [line.split("nowhere/")[1] for line in skipped] == expected
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", CHANGES)
 def test_changes_compose_and_have_folders_of_their_own(method):
     common, changes = ["experiment=dnerf", "data.scene=x"], CHANGES[method][::40]
@@ -161,6 +164,7 @@ def test_every_change_composes_and_changes_something(method):
             assert changed_keys or any("." not in key for key in keys), words
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("method", "count"), COUNTS.items())
 def test_the_price_list_changes_one_thing_at_a_time(method, count):
     changes = CHANGES[method]
@@ -238,6 +242,7 @@ def test_a_job_is_known_by_what_it_computes():
     assert folder_of(composed("data.scene=x", "data=dnerf")) == "runs/x/particles-fast-seed0"
 
 
+@pytest.mark.slow
 def test_what_stands_alone_begins_as_the_coarse_stage_would():
     full, alone = (composed(*HOOK, "preset=fast", f"ablation={name}").stage for name in ("full", "no_coarse"))
     assert alone.coarse is None

@@ -57,6 +57,7 @@ def test_a_step_on_what_is_occupied_learns_what_the_dense_one_learns():
     assert float((inside - everywhere)[present].abs().max()) < 1e-3 * scale
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "dense"), [("splat", True), ("fields", False), ("inpaint", False)])
 def test_every_operator_can_be_timed(name, dense):
     seen = []
@@ -82,6 +83,7 @@ def loop():
     return Loop(TINY)
 
 
+@pytest.mark.slow
 def test_the_figure_is_as_large_as_asked_and_stays_so(loop):
     assert (len(loop.method.means), len(loop.method.nodes.positions)) == (300, 9)
     before = loop.method.means.detach().clone()

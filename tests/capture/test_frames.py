@@ -37,6 +37,7 @@ def number_of(image):
     return round(float(np.median(image[image < 200])) / 8)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stamps", ["N*40", "N*(N+1)*10", "500+N*100"], ids=["even", "uneven", "late"])
 def test_stamps_are_the_videos_own_and_the_frames_asked_for_come(tmp_path, stamps):
     film = write_film(tmp_path / "a.mp4", numbered(24), stamps=stamps)
@@ -93,6 +94,7 @@ def test_frames_are_made_smaller_never_larger_by_as_many_threads_as_given(tmp_pa
     assert all("-threads 1 " in line and "-filter_threads 1 " in line for line in words)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("blur", "seen"), [(0, False), (1, False), (4, True), (8, True)])
 def test_a_films_blur_is_seen_whatever_the_codec_adds(tmp_path, blur, seen):
     """Coded as strongly as phones and web sites do."""
@@ -137,6 +139,7 @@ def npz_beside(path):
     return archive
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("make", "says"),
     [
@@ -158,6 +161,7 @@ def test_what_is_no_whole_video_is_refused(tmp_path, make, says):
         measure(make(tmp_path / "a.mp4"), quiet)
 
 
+@pytest.mark.slow
 def test_sound_may_go_on_after_the_last_frame(tmp_path):
     assert len(stamps_of(with_sound(noise(tmp_path / "a.mp4"), 3))) == 50
 

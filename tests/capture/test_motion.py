@@ -54,6 +54,7 @@ def test_a_film_in_which_only_the_camera_moves_has_no_movers(tmp_path):
     assert not any(mask.any() for mask in moving_masks(paths, cameras))
 
 
+@pytest.mark.slow
 def test_what_moves_at_any_time_does_not_rest(tmp_path):
     paths, cameras, truth = film(tmp_path, 2.0, count=18, rests_until=10)
     assert (moving_masks(paths, cameras)[0] & truth[0]).sum() < 0.1 * truth[0].sum()  # not yet

@@ -121,6 +121,7 @@ def test_what_cannot_be_read_is_refused(tmp_path):
         read_model(tmp_path / "torn")
 
 
+@pytest.mark.slow
 def test_lengths_in_a_model_are_not_believed_beyond_its_files(tmp_path):
     write_model(tmp_path / "sparse", cameras_on_arc(3), POINTS)
     pycolmap.Reconstruction(tmp_path / "sparse").write_binary(tmp_path / "sparse")
@@ -252,6 +253,7 @@ def test_a_first_look_is_refused_before_the_rest(tmp_path, monkeypatch):
     assert looks == [4, 4, 4, 4, None, None]
 
 
+@pytest.mark.slow
 def test_images_keep_their_numbers_whatever_is_looked_at_first(tmp_path):
     """Also a look at a few is gone on with; what is not looked at yet has no features to count."""
     (tmp_path / "images").mkdir()

@@ -60,6 +60,7 @@ def captured(scan, out, **options):
     return capture_record3d(scan, out, step, "capture.json", **options)
 
 
+@pytest.mark.slow
 def test_a_scan_becomes_a_scene_with_its_poses_and_depth(tmp_path):
     facts = captured(write_scan(tmp_path / "a.r3d"), tmp_path / "a")
     assert json.loads((tmp_path / "a" / "capture.json").read_text()) == facts
@@ -128,6 +129,7 @@ def test_what_is_wrong_in_a_scan_is_told_in_a_line(tmp_path, changes, message):
     assert not (tmp_path / "a").exists()
 
 
+@pytest.mark.slow
 def test_a_small_scan_asks_for_no_more_than_is_said(tmp_path):
     with zipfile.ZipFile(tmp_path / "a.r3d", "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("metadata", "[" + "[]," * 30_000_000 + "[]]")
@@ -172,6 +174,7 @@ def quaternion(pose):
     return [*(axis / (4 * w)).tolist(), float(w)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("w_first", [False, True])
 def test_the_orders_of_quaternions_and_of_the_matrix_are_told(tmp_path, w_first):
     files, rows, cameras = {}, [], walk(10, (48, 64))

@@ -65,6 +65,7 @@ def with_sound(path, sound):
     write_film(path, numbered(10), inputs=["-i", str(file), "-c:a", "aac"])
 
 
+@pytest.mark.slow
 def test_a_rig_of_films_is_heard_and_a_silent_one_is_named(tmp_path):
     """A film among them that heard another thing is named too; where none has sound, all begin together."""
     for name, sound in zip("abc", tracks([0.0, 0.25, 0.6], seconds=4.0)):
@@ -225,6 +226,7 @@ def textured(shift=0, seed=0):
     return np.roll(image.repeat(6, 0).repeat(6, 1), shift, 1)
 
 
+@pytest.mark.slow
 def test_a_camera_stands_though_something_moves_and_the_light_changes():
     still, frames = textured(), []
     for n in range(9):

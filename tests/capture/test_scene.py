@@ -88,6 +88,7 @@ def test_points_before_the_lens_neither_pull_near_to_it_nor_pass_unsaid():
     assert limits.near == pytest.approx(0.01, rel=0.2)
 
 
+@pytest.mark.slow
 def test_the_drawing_shows_cameras_points_and_box():
     found = placed(sparse_arc())
     image = draw(found, limits_of(found))
@@ -129,6 +130,7 @@ def test_facts_are_those_of_the_capture_and_are_told_with_advice():
     assert any("as captions or logos" in line for line in summary(facts | {"has_nearer": True}))
 
 
+@pytest.mark.slow
 def test_what_is_burnt_in_is_said_and_no_frame_trains_on_it(tmp_path):
     found = sparse_arc(count=4)
     sizes, times = dict.fromkeys(found.cameras, (320, 240)), dict(zip(found.cameras, range(4)))

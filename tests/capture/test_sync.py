@@ -28,6 +28,7 @@ def tracks(offsets, *, seconds=12.0, noise=0.02, seed=0, has_echo=True):
     return heard
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("noise", [0.001, 0.05])
 def test_offsets_are_found_through_echoes_and_noise(noise):
     found = synchronise(tracks(OFFSETS, noise=noise))
@@ -45,6 +46,7 @@ def test_films_of_other_lengths_and_a_turned_microphone_do_not_matter():
     assert found.is_sure().all()
 
 
+@pytest.mark.slow
 def test_one_that_heard_another_thing_is_not_believed_and_does_not_matter():
     heard = tracks(OFFSETS)
     found = synchronise([*heard, tracks([0.0], seed=9)[0]])
@@ -53,6 +55,7 @@ def test_one_that_heard_another_thing_is_not_believed_and_does_not_matter():
     assert found.is_sure().tolist() == [True, True, True, True, False]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [2, 6])
 def test_where_nothing_is_heard_by_two_nothing_is_believed(count):
     heard = [tracks([0.0], seed=seed)[0] for seed in range(count)]

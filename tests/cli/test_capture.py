@@ -134,12 +134,14 @@ def test_a_camera_that_turns_is_refused(refused, in_tmp):
     assert len(list((work / "pictures").iterdir())) == 6
 
 
+@pytest.mark.slow
 def test_hardly_any_texture_is_refused(refused, in_tmp):
     write_film(in_tmp / "few.mp4", numbered(4))
     said = refused("capture", "threads=1", "video=few.mp4")
     assert "hundreds of features to match, but got 6 in a picture; there is hardly any" in said
 
 
+@pytest.mark.slow
 def test_a_camera_that_stands_is_refused_also_by_images_with_spaces_and_alpha(refused, in_tmp):
     """That it stands is known from the matches alone."""
     (in_tmp / "p").mkdir()
@@ -178,6 +180,7 @@ def test_poses_that_are_known_become_a_scene(ok, refused, in_tmp):
     assert not [path for path in (in_tmp / "captures").iterdir() if path.name != "hand"]
 
 
+@pytest.mark.slow
 def test_poses_without_points_become_a_scene_whose_limits_its_reader_derives(ok, in_tmp):
     cameras = cameras_on_arc(8)
     write_images(in_tmp / "pictures", cameras)
@@ -191,6 +194,7 @@ def test_poses_without_points_become_a_scene_whose_limits_its_reader_derives(ok,
     assert max(degrees.max(), away.max()) < 1e-5
 
 
+@pytest.mark.slow
 def test_known_poses_keep_cut_outs_as_they_are_stored(ok, refused, in_tmp):
     """With names as phones give them, of which the next line can be typed."""
     name = "VID (1), it's"
@@ -229,6 +233,7 @@ def test_known_poses_keep_cut_outs_as_they_are_stored(ok, refused, in_tmp):
     assert "expected cameras of 320 x 240 pixels, as the pictures, but got 160 x 120" in said
 
 
+@pytest.mark.slow
 def test_masks_that_changed_are_read_again(forewarp, refused, in_tmp, monkeypatch):
     """Work that was interrupted is gone on with by the same masks alone."""
     cameras = cameras_on_arc(3)

@@ -21,6 +21,7 @@ def test_every_mode_is_an_option():
     assert tuple(options("debug")) == MODES
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize("model", FAMILIES)
 def test_a_mode_is_short_without_a_logger_and_in_a_folder_of_its_own(mode, model):
@@ -33,6 +34,7 @@ def test_a_mode_is_short_without_a_logger_and_in_a_folder_of_its_own(mode, model
     assert config.data.train_views == (3 if mode == "overfit" else 16)
 
 
+@pytest.mark.slow
 def test_what_is_typed_wins():
     words = ["debug=overfit", "data.train_views=5", "budget.iterations=7", "run=here", "data.scene=x"]
     config = composed(*words, "logger=csv")

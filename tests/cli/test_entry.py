@@ -52,6 +52,7 @@ def test_help_says_what_it_does_and_what_one_types(ok, name):
     assert done.err == ""
 
 
+@pytest.mark.slow
 def test_help_lists_every_choice(forewarp):
     lines = forewarp("train", "--help").out.splitlines()
     for group in ("data", "model", "model/view_dependence", "preset", "capture", "experiment", "trainer"):
@@ -59,6 +60,7 @@ def test_help_lists_every_choice(forewarp):
         assert line.split()[1::2] == options(group)
 
 
+@pytest.mark.slow
 def test_info_prints_where_options_come_from(ok, monkeypatch):
     for name, value in (("handlers", []), ("level", logging.WARNING)):  # Hydra sets them
         monkeypatch.setattr(logging.root, name, value)
@@ -108,6 +110,7 @@ def test_missing_conf_is_named(refused, monkeypatch, in_tmp):
     assert line.startswith(f"{in_tmp / 'conf'}: expected the configuration files, but got none; ")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("installed", [False, True])
 def test_data_lie_in_the_checkout_or_in_the_current_folder(forewarp, monkeypatch, in_tmp, installed):
     monkeypatch.delenv("FOREWARP_ROOT", raising=False)  # other tests compose in this process
@@ -120,6 +123,7 @@ def test_data_lie_in_the_checkout_or_in_the_current_folder(forewarp, monkeypatch
     assert shown.run.startswith("runs/")
 
 
+@pytest.mark.slow
 def test_options_of_ones_own_stand_beside_ours(ok, in_tmp):
     override = "defaults:\n  - override /model: backward\n\nseed: 7\n"
     sweep = "hydra: {sweeper: {params: {model: 'forward,backward'}}}\n"
@@ -132,6 +136,7 @@ def test_options_of_ones_own_stand_beside_ours(ok, in_tmp):
     assert config.hydra.sweeper.params.model == "forward,backward"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("arguments", "line"),
     [
@@ -176,6 +181,7 @@ def test_a_mistyped_command_ends_in_one_line(refused, in_tmp, arguments, line):
     assert list(in_tmp.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_naming_a_key_leaves_hydra_to_the_other_jobs_of_a_sweep():
     error = HydraException("Could not override 'budgt'")
     GlobalHydra.instance().clear()
@@ -224,6 +230,7 @@ def test_how_motion_begins_is_own_or_of_particles(refused, in_tmp):
     assert line.endswith("; add start_motion=own")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "key"), [("evaluate", "run"), ("train", "resume")])
 def test_a_bare_folder_is_a_run(refused, in_tmp, name, key):
     (in_tmp / "demo").mkdir()
@@ -318,6 +325,7 @@ def test_what_a_command_cannot_take_is_refused_with_what_to_type(refused, things
     assert says in refused(name, word)
 
 
+@pytest.mark.slow
 def test_an_interpolation_is_typed_as_it_is(refused, in_tmp):
     line = "${x}: expected a key of the configuration, but got none of this name; no name may hold ${"
     assert refused("train", "data.scene=a${x}b") == line
@@ -330,6 +338,7 @@ def test_a_number_of_seeds_that_would_run_nothing_is_refused(refused, in_tmp, se
     assert refused("train", "--multirun", f"seeds={seeds}") == line
 
 
+@pytest.mark.slow
 def test_the_whole_story_on_demand(forewarp, monkeypatch, in_tmp):
     monkeypatch.setenv("FOREWARP_TRACEBACK", "1")
     done = forewarp("train", "seeds=2")
@@ -337,6 +346,7 @@ def test_the_whole_story_on_demand(forewarp, monkeypatch, in_tmp):
     assert "Traceback" in done.err
 
 
+@pytest.mark.slow
 def test_a_bug_keeps_its_traceback(forewarp, monkeypatch, in_tmp):
     def broken(config):
         raise RuntimeError("oops")
@@ -348,6 +358,7 @@ def test_a_bug_keeps_its_traceback(forewarp, monkeypatch, in_tmp):
     assert done.err.endswith("forewarp-train: error: RuntimeError: oops; this is a bug, please report it\n")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("by", ["ctrl-c", "lightning"])
 @pytest.mark.parametrize(
     ("number", "status", "says"),
@@ -403,6 +414,7 @@ def test_one_line(error, line):
     assert one_line(error).startswith(line)
 
 
+@pytest.mark.slow
 def test_a_killed_command_leaves_no_temporary_folder(ok, monkeypatch, in_tmp):
     """Whatever there is while a job runs would stay where the process is killed."""
     there = []
@@ -471,6 +483,7 @@ def test_a_pattern_of_names_is_taken_as_typed(ok, in_tmp, monkeypatch):
     assert seen == ["(?P<frame>[0-9]+)$"]
 
 
+@pytest.mark.slow
 def test_a_terminal_that_knows_ascii_only_shows_other_characters_escaped():
     code = "from forewarp.cli.entry import quiet; quiet(); print('Gr\u00f6\u00dfe')"
     environment = {**os.environ, "PYTHONIOENCODING": "ascii"}

@@ -1,10 +1,13 @@
 import json
 
+import pytest
+
 from forewarp.report.results import read_runs
 
 ELSEWHERE = "name=SC-GS (authors' code)", "data=dnerf", "data.scene=vehicle"
 
 
+@pytest.mark.slow
 def test_images_from_elsewhere_are_a_row_of_every_report(fitted, ok, refused, in_tmp):
     scenes = f"data.root={fitted.parent / 'scenes'}"
     done = ok("evaluate", f"renders={fitted / 'images'}", *ELSEWHERE, scenes, "minutes=20", "device=RTX 3090")
@@ -37,6 +40,7 @@ def test_a_folder_of_other_files_is_not_written_into(fitted, refused):
     assert "expected an empty folder, or images of a" in refused("evaluate", *words)
 
 
+@pytest.mark.slow
 def test_what_images_from_elsewhere_lack_is_named(fitted, refused):
     assert refused("evaluate", f"renders={fitted / 'images'}").startswith("name: expected what tables call")
     assert refused("evaluate", "renders=here", "name=a").startswith("data: expected the scene")

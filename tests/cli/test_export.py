@@ -13,6 +13,7 @@ from forewarp.export import formats
 from tests.support.configs import CONF
 
 
+@pytest.mark.slow
 def test_it_writes_what_the_run_has_into_its_folder_and_says_so(forewarp, ok, fitted, tmp_path, monkeypatch):
     run, sources, write = shutil.copytree(fitted, tmp_path / "vehicle"), [], formats.write
     text = (run / "config.yaml").read_text()
@@ -63,6 +64,7 @@ def test_mistakes_end_before_anything_is_loaded(monkeypatch, words, says):
         check(config)
 
 
+@pytest.mark.slow
 def test_a_method_without_particles_has_no_layers(refused, fitted):
     says = "expected a run of particles, as they alone tell what moves, but got one of another method"
     assert refused("export", f"run={fitted}", "layer=moving", "times=2") == f"layer: {says}; leave it out"
@@ -71,6 +73,7 @@ def test_a_method_without_particles_has_no_layers(refused, fitted):
     assert not (fitted / "exports").exists()
 
 
+@pytest.mark.slow
 def test_a_folder_of_others_is_left_alone(refused, fitted, in_tmp):
     (in_tmp / "a file").touch()
     said = refused("export", f"run={fitted}", "out=.")

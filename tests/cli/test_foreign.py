@@ -199,6 +199,7 @@ def test_the_page_of_a_run_takes_trust(ok, sheen, monkeypatch):
     assert "Rendering" not in ok(*page, TRUST).out
 
 
+@pytest.mark.slow
 def test_the_environment_goes_along_whatever_a_launcher_hands_on(ok, sheen, monkeypatch):
     """A job of another process or machine: its environment is its own."""
     import hydra
@@ -248,6 +249,7 @@ def test_a_method_is_swept_beside_ours_and_reported(ok, found, in_tmp):
     assert "balls-fast" in (in_tmp / "page" / "accuracy-time.md").read_text()
 
 
+@pytest.mark.slow
 def test_an_installed_package_is_listed_and_its_options_compose(ok, work):
     """No code of it runs."""
     listed = ok("train", "--help").out
@@ -261,6 +263,7 @@ def test_an_installed_package_is_listed_and_its_options_compose(ok, work):
     assert "mine" not in sys.modules
 
 
+@pytest.mark.slow
 def test_options_of_ours_win_over_those_of_an_installed_package(work, tmp_path, monkeypatch):
     (tmp_path / "other" / "conf" / "model").mkdir(parents=True)
     (tmp_path / "other" / "conf" / "model" / "nerf.yaml").write_text("name: stolen\n")
@@ -269,6 +272,7 @@ def test_options_of_ours_win_over_those_of_an_installed_package(work, tmp_path, 
     assert yaml.safe_load(call("train", "model=nerf", "--cfg", "job").out)["model"]["name"] == "nerf"
 
 
+@pytest.mark.slow
 def test_an_entry_point_without_options_is_told_and_stops_nothing(work, tmp_path, monkeypatch):
     install('[project.entry-points."forewarp.methods"]\nx = "nowhere.at.all"', tmp_path, "other")
     monkeypatch.syspath_prepend(str(tmp_path))

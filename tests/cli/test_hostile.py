@@ -120,6 +120,7 @@ def test_nothing_outside_is_written(kind, name, fitted, outside, forewarp):
         assert named in done.err.splitlines()[-1]
 
 
+@pytest.mark.slow
 def test_the_folder_itself_may_be_a_link(fitted, in_tmp, forewarp):
     shutil.copytree(fitted, "disk/run")
     Path("run").symlink_to("disk/run")
@@ -152,6 +153,7 @@ if __name__ == "__main__":
 """
 
 
+@pytest.mark.slow
 def test_no_process_that_is_started_imports_of_the_current_folder(in_tmp):
     """Neither what begins workers nor what they import; in a process of its own, as commands are."""
     if sys.version_info < (3, 11):
@@ -175,6 +177,7 @@ with ProcessPoolExecutor(1, get_context("spawn")) as pool:
 """
 
 
+@pytest.mark.slow
 def test_workers_of_typed_code_import_nothing_of_the_current_folder(in_tmp):
     """Where the first place to import from is the current folder, whatever it is: an empty text."""
     Path("planted.py").write_text("open('trace', 'w')\n")

@@ -115,6 +115,7 @@ def test_one_command_calls_all_others_and_says_in_a_users_words_what_came_of_it(
     assert "see it train: http://127.0.0.1:" in done.err
 
 
+@pytest.mark.slow
 def test_the_same_command_goes_on_and_another_quality_trains_alone_anew(
     forewarp, ok, refused, in_tmp, commands
 ):
@@ -139,6 +140,7 @@ def test_the_same_command_goes_on_and_another_quality_trains_alone_anew(
     assert "theirs: expected a new folder, or one of this clip" in refused("open", "a.mp4", "out=theirs")
 
 
+@pytest.mark.slow
 def test_what_fails_ends_the_command_with_its_line(forewarp, in_tmp):
     (in_tmp / "a.mp4").write_bytes(b"no film")
     done = forewarp("open", "a.mp4", "browser=false")

@@ -28,6 +28,7 @@ def test_a_film_of_each_path(forewarp, run, path):
     assert abs(film[1:] - film[:-1]).max((1, 2, 3)).min() > 10  # which moves
 
 
+@pytest.mark.slow
 def test_trajectories_are_drawn_over_fixed(ok, run):
     for path in ("fixed", "trajectories"):
         ok("render", f"run={run}", f"path={path}", "frames=3", "format=png", "size=48")
@@ -45,6 +46,7 @@ def test_a_gif_of_small_images_is_larger_and_large_images_keep_their_size(ok, ru
         assert iio.imread(run / "videos" / "fixed.gif").shape[:3] == (2, side, side)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("word", "says"),
     [

@@ -5,6 +5,7 @@ from tests.support.runs_on_disk import write_run
 KINDS = "accuracy_time, price_list, paper, ablation, minutes, methods, effects, search, table, compare, run"
 
 
+@pytest.mark.slow
 def test_pages_are_written_and_named(ok, in_tmp):
     write_run("runs/accuracy_time")
     for kind, page in (("accuracy_time", "accuracy-time.md"), ("price_list", "price-list.md")):
@@ -29,6 +30,7 @@ def test_the_help_has_a_line_for_each_kind(forewarp):
         assert len([line for line in text.splitlines() if line.split()[:1] == [f"kind={kind}"]]) == 1
 
 
+@pytest.mark.slow
 def test_without_a_kind_nothing_is_written_but_the_help(forewarp, in_tmp):
     write_run("runs/accuracy_time")
     done = forewarp("report")

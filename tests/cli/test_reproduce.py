@@ -120,6 +120,7 @@ def test_a_failed_sweep_stops_no_other_and_its_status_is_kept(monkeypatch):
     assert sorted(called) == sorted([("train", "1 | ")] * 3 + [("train", "2 | "), ("report", "")])
 
 
+@pytest.mark.slow
 def test_what_a_page_costs_lists_each_run_where_that_is_asked_for(in_tmp):
     job = plan_of("accuracy-time", Keys.typed(["changes=stage.fine.density=45,90", "more=trainer=cpu"]))
     first, *lines = reproduce.cost_of(job, listed=True)

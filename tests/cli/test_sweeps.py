@@ -87,6 +87,7 @@ def test_choices_of_particles_are_fitted_and_listed(ok, in_tmp):
             assert frozenset(words or ["base"]) in rows, change
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(bool(find_spec("hydra_plugins.hydra_joblib_launcher")), reason="it is installed")
 def test_a_launcher_that_is_not_installed_says_what_to_install(refused, in_tmp):
     expected = "expected the package of hydra/launcher=joblib, but got none; install forewarp[sweeps]"
@@ -218,6 +219,7 @@ def test_jobs_that_fail_are_named_and_stop_no_other(launcher, start, tmp_path):
     assert len(measured(tmp_path)) == 1
 
 
+@pytest.mark.slow
 def test_a_cost_that_cannot_be_told_ends_a_command_that_asks_for_it_alone(
     refused, in_tmp, monkeypatch, capsys
 ):

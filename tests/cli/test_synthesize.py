@@ -15,6 +15,7 @@ SMALL = ["size=16", "frames=3", "test_views=[1,1,1]", "val_views=0", "samples_pe
 ARGUMENTS = {"size": 16, "frames": 3, "test_views": [1, 1, 1], "val_views": 0, "samples_per_pixel": 1}
 
 
+@pytest.mark.slow
 def test_writes_a_scene_that_reads(forewarp, in_tmp):
     done = forewarp("synthesize", "folder=a/s", *SMALL)
     assert (done.status, done.out) == (0, "written: a/s\n")
@@ -32,6 +33,7 @@ def test_keeps_a_scene_unless_told_otherwise(forewarp, ok, refused, in_tmp):
     assert json.loads((in_tmp / "s" / "synthesis.json").read_text())["seed"] == 1
 
 
+@pytest.mark.slow
 def test_never_overwrites_what_is_no_scene(refused, in_tmp):
     (in_tmp / "s").mkdir()
     (in_tmp / "s" / "thesis.txt").write_text("dear")
@@ -40,6 +42,7 @@ def test_never_overwrites_what_is_no_scene(refused, in_tmp):
     assert "expected a folder, but got the file" in refused("synthesize", "folder=s/thesis.txt")
 
 
+@pytest.mark.slow
 def test_runs_that_begin_together_write_a_scene_once(tmp_path, monkeypatch):
     written = []
 
@@ -57,6 +60,7 @@ def test_runs_that_begin_together_write_a_scene_once(tmp_path, monkeypatch):
     assert module.is_scene(tmp_path / "s")
 
 
+@pytest.mark.slow
 def test_every_dataset_has_a_writer_whose_defaults_are_the_configs():
     assert sorted(module.WRITERS) == options("dataset")
     for name, writer in module.WRITERS.items():

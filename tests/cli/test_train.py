@@ -160,6 +160,7 @@ def test_evaluating_again_gives_the_same_numbers_or_others(ok, fitted, copied, s
     assert numbers(copied)["test"] != numbers(fitted)["test"]
 
 
+@pytest.mark.slow
 def test_the_same_command_again_trains_nothing(ok, fitted, scenes, monkeypatch):
     monkeypatch.setattr(lightning.Trainer, "fit", lambda *_, **__: pytest.fail("trained again"))
     before, config = numbers(fitted), (fitted / "config.yaml").read_text()
@@ -169,6 +170,7 @@ def test_the_same_command_again_trains_nothing(ok, fitted, scenes, monkeypatch):
     assert done.out.startswith(f"measured before: {fitted}; again with\n  forewarp-evaluate run={fitted}\n")
 
 
+@pytest.mark.slow
 def test_a_begun_run_is_finished_and_measured_and_what_does_not_matter_may_change(ok, fitted, begun, scenes):
     done = ok(*arguments(scenes, begun, "checkpoint_seconds=5"))
     lines = done.out.splitlines()
@@ -234,12 +236,14 @@ def test_renderings_of_an_inpainter_are_both_scored(ok, scenes, tmp_path):
     assert set(content["seconds"]) == {"train", "coarse", "render_per_frame", "render_again_per_frame"}
 
 
+@pytest.mark.slow
 def test_another_configuration_is_refused(refused, fitted, scenes):
     line, _, advice = refused(*arguments(scenes, fitted, "seed=1")).partition("; ")
     assert line.endswith("seed: expected 0, as the run that this folder holds, but got 1 (and 1 more keys)")
     assert advice == "use run=<another folder>, or delete this one"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("word", "says"),
     [
@@ -262,6 +266,7 @@ def test_what_cannot_be_trained_makes_no_folder(refused, scenes, in_tmp, monkeyp
     assert not (in_tmp / "run").exists()
 
 
+@pytest.mark.slow
 def test_a_broken_step_ends_in_one_line_and_is_stored(refused, scenes, in_tmp):
     line = refused(*arguments(scenes, "run", *SHORT, "stage.coarse.lr.color=1e39"))
     assert line.startswith("stage.coarse: expected finite numbers, but got parameter: radiance.color at step")
@@ -330,6 +335,7 @@ def test_paths_and_names_are_taken_as_typed(fitted, in_tmp, ok):
     assert (root / "läufe" / name / "metrics.json").is_file()
 
 
+@pytest.mark.slow
 def test_plan_only_says_what_a_run_costs_and_writes_nothing(ok, scenes, in_tmp):
     done = ok(*arguments(scenes, "run", "plan_only=true"))
     first, *_, last = done.out.splitlines()

@@ -36,6 +36,7 @@ def taken():
         yield server.getsockname()[1]
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("_ctrl_c")
 def test_it_says_where_the_page_is_and_ends_with_ctrl_c(ok, fitted):
     done = ok("view", str(fitted), f"run2={fitted}", "port=0")
@@ -59,6 +60,7 @@ def test_mistakes_end_before_anything_is_loaded(fitted, words, says):
         view(OmegaConf.merge(composed(name="view"), changes))
 
 
+@pytest.mark.slow
 def test_a_taken_port_and_a_run_that_is_not_finished_end_in_one_line(refused, fitted, tmp_path, taken):
     said = refused("view", f"run={fitted}", f"port={taken}")
     assert said.startswith(f"port: expected a free port, but got {taken}, which is in use")
@@ -83,6 +85,7 @@ def test_two_runs_of_different_scenes_are_refused():
             refuse_other_scene(scene, replace(scene, **changes))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("words", [["view", "run={run}"], ["train", "resume={run}", "viewer=true"]])
 def test_without_the_extra_it_says_what_to_install(refused, fitted, monkeypatch, words):
     monkeypatch.setitem(sys.modules, "viser", None)
@@ -90,6 +93,7 @@ def test_without_the_extra_it_says_what_to_install(refused, fitted, monkeypatch,
     assert said == "viewer: expected viser, but got none; install forewarp[viewer]"
 
 
+@pytest.mark.slow
 def test_training_with_a_page_asks_for_its_port_before_anything_else(refused, in_tmp, taken):
     says = refused("train", "viewer=true", f"port={taken}", "effects=auto")
     assert says.startswith(f"port: expected a free port, but got {taken}")

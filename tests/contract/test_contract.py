@@ -84,6 +84,7 @@ def data_camera(found):
     return found.run.datamodule.scene.train[1].camera
 
 
+@pytest.mark.slow
 @on(DATASETS)
 def test_any_time_can_be_rendered(name, dataset, fitted):
     found = fitted(name, dataset)
@@ -118,6 +119,7 @@ def test_pixels_and_crops_are_parts_of_the_whole_picture(name, dataset, fitted):
             torch.testing.assert_close(getattr(part, key), expected, atol=1e-5, rtol=1e-5)
 
 
+@pytest.mark.slow
 @each
 def test_gradients_and_all_terms_are_finite(name, scenes):
     data, entry = data_of("dnerf", scenes), METHODS[name]
@@ -131,6 +133,7 @@ def test_gradients_and_all_terms_are_finite(name, scenes):
     assert all(torch.tensor(value).isfinite() for value in raw.values())
 
 
+@pytest.mark.slow
 @each
 def test_every_parameter_has_one_rate(name, scenes):
     module = module_of(METHODS[name], data_of("dnerf", scenes))
@@ -196,6 +199,7 @@ def straight(scenes, tmp_path_factory):
     return fit
 
 
+@pytest.mark.slow
 @each
 def test_two_runs_of_one_seed_are_equal(name, straight, scenes, tmp_path):
     torch.manual_seed(5)  # nothing that was drawn before matters

@@ -3,6 +3,8 @@
 import importlib
 import re
 
+import pytest
+
 from forewarp.training.checkpoints import load_handover
 from tests.contract.fitting import Losses, run_of, stage_of
 from tests.contract.scenes import data_of
@@ -17,6 +19,7 @@ def block_of(title, language="python"):
     return re.search(rf"```{language}\n(.*?)```", text, re.DOTALL)[1]
 
 
+@pytest.mark.slow
 def test_the_method_of_the_page_learns(scenes, tmp_path, monkeypatch):
     path = tmp_path / "page_of_extending.py"
     path.write_text(block_of("A method"))

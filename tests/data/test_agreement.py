@@ -49,6 +49,7 @@ def write_rig(folder, order, paint=painted):
     write_poses(folder, [CAMERAS[k] for k in order], near=8.0, far=40.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("by", ["number", "text"])
 def test_rows_of_a_rig_are_in_the_order_in_which_views_agree(tmp_path, by):
     texts = sorted(range(12), key=lambda k: f"cam{k + 1}")
@@ -63,6 +64,7 @@ def test_rows_of_a_rig_are_in_the_order_in_which_views_agree(tmp_path, by):
     torch.testing.assert_close(told.train[5].camera.camera_to_world, scene.train[5].camera.camera_to_world)
 
 
+@pytest.mark.slow
 def test_images_that_do_not_tell_the_order_are_refused(tmp_path):
     write_rig(tmp_path / "toy", range(12), lambda camera: torch.full((camera.height, camera.width, 3), 0.5))
     with refused("cam1, cam2, cam3 by number, cam1, cam10, cam11 as texts.*data.camera_order=number or"):
@@ -76,6 +78,7 @@ def test_views_of_one_place_or_without_texture_tell_nothing():
     assert leaning(cameras, [nothing, nothing]) is None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["axis", "ray"])
 def test_depth_along_rays_is_told_from_depth_along_the_axis(tmp_path, kind):
     folder = write_video(tmp_path / "toy")

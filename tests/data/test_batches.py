@@ -182,6 +182,7 @@ def test_a_batch_may_have_rays_of_several_frames_of_one_time(scene):
         assert len(batch.observations) == count
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("background", ["white", "random"])
 def test_crops_are_square_parts_of_an_image_over_one_colour(scene, background):
     sampler, corners = Sampler(scene, background=background, asks=Asks("crops", side=3)), set()
@@ -251,6 +252,7 @@ def test_batches_repeat_and_continue_exactly(scene, options):
     assert torch.equal(colours(other), expected)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("depth", [False, True])
 def test_reduced_truth_is_what_half_resolution_loads(tmp_path, depth):
     write_dnerf(tmp_path / "toy", test=dnerf_shots(3, 2, (6, 8), depth=depth))

@@ -413,6 +413,7 @@ def test_what_mends_it_is_of_the_format_and_one_cause_has_one_line(dataset, near
         assert key not in f"{near} {error.value}"
 
 
+@pytest.mark.slow
 def test_point_clouds_in_millimetres_have_one_line_with_a_key_that_is_there(tmp_path):
     folder = write_dome(tmp_path / "toy")
     for path in folder.glob("pointclouds/*.npy"):
@@ -446,6 +447,7 @@ def test_test_times_beyond_those_of_training_are_told(shift, doubted):
     assert ["lie outside training's, 0 to 0.5, of which" in line for line in lines] == [True] * doubted
 
 
+@pytest.mark.slow
 def test_all_cameras_of_a_long_walk_are_asked_for_points_at_no_cost_of_their_size(monkeypatch):
     """Cameras every metre along a street look across; points are 3 m away; masks of 12 Mpx are not made."""
     up, frames, bytes_of = torch.tensor([0.0, 0.0, 1.0]), [], []
@@ -509,6 +511,7 @@ def test_masks_the_other_way_round_are_told_by_points_or_their_place():
     assert "hide" not in with_motion(~middle, key="load_valid")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("keys", "change", "said"),
     [

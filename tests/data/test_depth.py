@@ -85,6 +85,7 @@ def told_of(folder, depth, **options):
     return scene, [line for line in scene.protocol["assumed"] if "depth" in line.partition(": ")[2]]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("none", "why"),
     [
@@ -110,6 +111,7 @@ def test_a_number_for_no_depth_is_a_hole_and_said(tmp_path, none, why):
     assert told_of(folder, np.where(depth > 100, 0, depth))[1] == []
 
 
+@pytest.mark.slow
 def test_few_depths_far_beyond_far_are_holes_and_those_just_beyond_it_are_kept(tmp_path):
     folder = write_video(tmp_path / "toy")
     depth = np.linspace(40, 150, 600, dtype=np.float32).reshape(20, 30)
@@ -119,6 +121,7 @@ def test_few_depths_far_beyond_far_are_holes_and_those_just_beyond_it_are_kept(t
     assert (frame.load_sensed()[0] == 0).sum() == 1
 
 
+@pytest.mark.slow
 def test_full_numbers_of_a_png_are_said_and_the_unit_that_fits_is_named(tmp_path):
     folder = write_video(tmp_path / "toy")
     depth = np.full((20, 30), 40_000, np.uint16)
@@ -157,6 +160,7 @@ def test_a_line_needs_points_that_agree():
     assert (a, b) == (pytest.approx(1e-11), pytest.approx(2))  # of values of any size
 
 
+@pytest.mark.slow
 def test_depth_of_a_video_is_in_the_units_of_its_poses(tmp_path):
     folder = write_video(tmp_path / "toy")
     (tmp_path / "lidar").mkdir()
@@ -284,6 +288,7 @@ def unseen(depth, number):
     return depth
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("change", "line"),
     [
@@ -314,6 +319,7 @@ def test_what_views_contradict_in_depths_is_a_hole_or_named(tmp_path, room, chan
         assert np.array_equal(frame.load_sensed()[0].numpy() > 0, expected)
 
 
+@pytest.mark.slow
 def test_transposed_depths_of_square_images_are_named(tmp_path):
     square = [(camera, *shown(camera)) for camera in walk(size=(48, 48))]
     assert "if depths are transposed; turn them" in "".join(read_room(tmp_path, square, lambda d: d.T)[1])
@@ -329,6 +335,7 @@ def test_a_limit_that_views_do_not_contradict_is_kept_and_said(tmp_path):
     assert frames[0].load_sensed()[0].min() > 0
 
 
+@pytest.mark.slow
 def test_levels_of_confidence_are_told_by_all_files(tmp_path, room):
     for most, trust in ((2, [0, 0.5, 1]), (255, [0, 1 / 255, 2 / 255])):
         for k in range(8):

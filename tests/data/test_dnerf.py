@@ -104,6 +104,7 @@ def test_a_known_point_projects_where_it_was_painted(tmp_path):
 REAL = {"bouncingballs": 150, "hellwarrior": 100, "hook": 100, "jumpingjacks": 200, "lego": 50, "mutant": 150}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", REAL)
 def test_real_scenes_read(name):
     scene = read_scene(real("dnerf"), name, box=[-1.5] * 3 + [1.5] * 3)
@@ -114,6 +115,7 @@ def test_real_scenes_read(name):
     assert scene.train[-1].load().shape == (400, 400, 4)
 
 
+@pytest.mark.slow
 def test_the_released_size_halves_to_the_published_one():
     full, half = read_scene(real("dnerf_800"), "hellwarrior"), read_scene(real("dnerf"), "hellwarrior")
     assert (full.protocol["half_resolution"], half.protocol["half_resolution"]) == (True, False)
@@ -123,6 +125,7 @@ def test_the_released_size_halves_to_the_published_one():
         assert (a.load().int() - b.load().int()).abs().max() <= 1
 
 
+@pytest.mark.slow
 def test_round_trip_of_three_kinds_of_test_view(tmp_path):
     write_lego(tmp_path / "lift")
     scene = read_lego_complete(tmp_path, "lift")
@@ -138,6 +141,7 @@ def test_round_trip_of_three_kinds_of_test_view(tmp_path):
     assert scene.protocol | expected == scene.protocol
 
 
+@pytest.mark.slow
 def test_what_differs_from_the_published_counts_is_said_once(tmp_path, monkeypatch):
     folder = write_lego(tmp_path / "lift", train=dnerf_shots(4, times=[0, 0, 0.5, 1]))
     edit(folder / "transforms_test_space.json", {"frames.0.time": 0.25})
@@ -155,6 +159,7 @@ def test_what_differs_from_the_published_counts_is_said_once(tmp_path, monkeypat
     assert "note" not in read_lego_complete(tmp_path, "lift").protocol
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("place", ["", "frames.1."])
 def test_depth_may_be_a_png_with_its_scale(tmp_path, place):
     folder = write_lego(tmp_path / "lift")
@@ -172,6 +177,7 @@ def test_depth_may_be_a_png_with_its_scale(tmp_path, place):
     assert halved == pytest.approx((1000 + 8000 + 9000) / 3 * 1e-4)  # of the three met
 
 
+@pytest.mark.slow
 def test_an_ability_may_have_its_file_in_its_folder(tmp_path):
     folder = write_lego(tmp_path / "lift")
     text = (folder / "transforms_test_space.json").read_text()
@@ -199,6 +205,7 @@ def ball_shots(kind, none=0.0, unit=1.0, radius=1.0):
         yield Shot(f"r_{i}", i / 9, pose, rgba, depth.float())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("kind", "other"), [("ray", "axis"), ("axis", "ray")])
 def test_which_kind_exact_depth_is_follows_from_near_views(tmp_path, kind, other):
     exact = [shot.depth for shot in ball_shots("ray", radius=1.8)]
@@ -217,6 +224,7 @@ def test_which_kind_exact_depth_is_follows_from_near_views(tmp_path, kind, other
         assert "taken for depth along the pixels' rays; if it is along the optical axis, set" in line
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("none", [1e10, 65504.0, 1000.0, 5.0])
 def test_a_renderers_number_for_no_depth_is_background_and_said(tmp_path, none):
     write_dnerf(tmp_path / "toy", (64, 64), test=ball_shots("ray", none))
@@ -227,6 +235,7 @@ def test_a_renderers_number_for_no_depth_is_background_and_said(tmp_path, none):
     assert f"are {none:.6g}, {why}: taken for holes" in scene.protocol["assumed"][0]
 
 
+@pytest.mark.slow
 def test_depth_in_another_unit_is_told_with_its_scale(tmp_path):
     folder = write_dnerf(tmp_path / "toy", (64, 64), test=ball_shots("ray", unit=1000.0))
     (line, _) = read_scene(tmp_path, "toy").protocol["assumed"]

@@ -57,6 +57,7 @@ def decoded_again(*_):
     raise AssertionError("a film was decoded again")
 
 
+@pytest.mark.slow
 def test_frames_are_the_same_as_from_memory_and_what_they_take_is_told_before(
     root, small, tmp_path, capsys, monkeypatch
 ):

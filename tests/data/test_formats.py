@@ -248,6 +248,7 @@ def rows(table):
     return [(key, *row) for key, group in table.items() for row in group]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "file", "how", "match"), rows(BAD))
 def test_a_harmed_scene_is_refused_when_it_is_read(scene, name, file, how, match):
     folder = scene(name)
@@ -276,6 +277,7 @@ LATER = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "file", "how", "match"), rows(LATER))
 def test_what_goes_bad_later_is_refused_when_it_is_loaded(scene, name, file, how, match):
     folder = scene(name)
@@ -481,6 +483,7 @@ def test_a_rewritten_scene_keeps_nothing_of_the_old_one(tmp_path, name):
         assert [f.name for f in getattr(found, split)] == [f.name for f in getattr(expected, split)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["dnerf", "hypernerf", "nhr"])
 def test_a_box_is_as_given_or_bounds_all_training_rays(tmp_path, name):
     read, write, _ = FORMATS[name]

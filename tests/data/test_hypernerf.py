@@ -129,6 +129,7 @@ def test_names_tell_the_moment_where_warp_id_counts_one_camera_after_the_other(t
     assert "assumed" not in counted(lambda items: sorted(items, key=lambda i: i.split("_")[1])).protocol
 
 
+@pytest.mark.slow
 def test_time_ids_in_two_units_and_of_one_moment_are_named(tmp_path):
     folder = write_rig(tmp_path / "toy", rig(times=24))
     val = json.loads((folder / "dataset.json").read_text())["val_ids"]
@@ -272,6 +273,7 @@ def test_a_genuine_lens_is_undone():
     assert (depth > 0).all()
 
 
+@pytest.mark.slow
 def test_a_genuine_capture_by_three_phones_is_understood(tmp_path):
     source, folder = real("hypernerf") / "paper-windmill-no-images", tmp_path / "windmill"
     (folder / "rgb" / "2x").mkdir(parents=True)
@@ -314,6 +316,7 @@ def test_images_that_are_missing_are_left_out_and_jpeg_is_read(tmp_path):
 # A phone that measures depth -------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scale", [1, 2])
 def test_round_trip_of_a_film_with_depth(tmp_path, scale):
     write_rig(tmp_path / "toy", film(), fps=10.0)
@@ -334,6 +337,7 @@ def test_round_trip_of_a_film_with_depth(tmp_path, scale):
     assert read_scene(tmp_path, "toy").train[0].load_sensed is None
 
 
+@pytest.mark.slow
 def test_depths_may_be_millimetres(tmp_path):
     metres, folder = write_rig(tmp_path / "a", film()), write_rig(tmp_path / "b", film(unit=1000.0))
     expected, scene = (read_scene(f.parent, f.name, depth="depth") for f in (metres, folder))
@@ -443,6 +447,7 @@ def evidence(folder, **changes):
     return "; ".join([*scene.protocol.get("assumed", []), *remarks(scene)])
 
 
+@pytest.mark.slow
 def test_evidence_that_says_little_or_other_things_is_told(tmp_path):
     for number, (kind, change, said) in enumerate(
         [

@@ -57,6 +57,7 @@ def test_what_rows_contradict_is_refused(folder):
         as_transforms(folder)
 
 
+@pytest.mark.slow
 def test_images_as_texts_or_numbers_are_told_by_views(tmp_path):
     for k in range(12):
         write_image(tmp_path / "toy" / "images" / f"{k}.png", torch.zeros(32, 48, 3, dtype=torch.uint8))

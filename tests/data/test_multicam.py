@@ -52,6 +52,7 @@ def tells(image):
     return [round((float(image[..., x, 0].float().mean()) - 20) / 20) for x in (2, -2)]
 
 
+@pytest.mark.slow
 def test_films_are_read_as_a_rig_whose_first_camera_is_held_out(films):
     scene = read_scene(films, "toy")
     assert [f.name for f in scene.test] == [f"cam00/{n:04d}" for n in range(4)]
@@ -318,6 +319,7 @@ def test_a_film_that_may_begin_later_is_said_also_of_few_frames(films, tmp_path)
     assert "cam01.mp4 has 3 frames, others up to 4: all are cut to the first 2; a film that begins" in line
 
 
+@pytest.mark.slow
 def test_films_of_two_rates_or_none_at_all_are_refused(films, tmp_path):
     folder = shutil.copytree(films / "toy", tmp_path / "toy")
     write_film(folder / "cam01.mp4", numbered(6, (32, 48)), stamps="N*40")
@@ -328,6 +330,7 @@ def test_films_of_two_rates_or_none_at_all_are_refused(films, tmp_path):
         read_scene(tmp_path, "toy")
 
 
+@pytest.mark.slow
 def test_films_that_drift_are_said(films, tmp_path):
     folder = shutil.copytree(films / "toy", tmp_path / "toy")
     for name, step in (("cam00", "40"), ("cam01", "40.2")):

@@ -114,6 +114,7 @@ def test_odd_sizes_are_halved_exactly(tmp_path):
     assert scene.times == (0.0,)
 
 
+@pytest.mark.slow
 def test_held_out_views(tmp_path, written):
     write_dome(tmp_path / "many", dome(56, sizes=((2, 2),)), 1)
     assert read_scene(tmp_path, "many").protocol["test_views"] == [0, 9, 18, 28, 37, 46]

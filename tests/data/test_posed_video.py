@@ -184,6 +184,7 @@ def test_only_a_focal_length_is_needed_and_no_order(tmp_path):
     assert (camera.fy, camera.cx, camera.cy, camera.lens) == (camera.fx, 15, 10, None)
 
 
+@pytest.mark.slow
 def test_given_times_are_kept(tmp_path, made):
     times = [0.9, 0.1, 0.2, 0.3, 0.35, 0.5, 0.6, 0.7, 0.8, 0.0]
     scene = made(times=times)
@@ -429,6 +430,7 @@ def test_of_masks_those_of_the_scale_are_read_or_else_those_of_full_size(tmp_pat
     assert read_scene(tmp_path, "toy", scale=2).train[0].load_valid().all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("brightness", [255, 1, 38])
 def test_masks_of_nerfstudio_tell_where_to_train_and_measure(tmp_path, masked, brightness):
     mask = torch.from_numpy(masked(brightness))
@@ -449,6 +451,7 @@ def test_masks_of_nerfstudio_tell_where_to_train_and_measure(tmp_path, masked, b
     assert read_scene(tmp_path, "toy", masks="off").train[0].load_valid is None
 
 
+@pytest.mark.slow
 def test_what_moves_is_written_and_read_at_every_scale(tmp_path, made):
     made()
     file, (width, height), moving = tmp_path / "toy" / FILE, (30, 20), np.zeros((20, 30), bool)
@@ -732,6 +735,7 @@ def test_absolute_paths_are_read_inside_the_scene_or_what_is_there_is_named(tmp_
         read_scene(tmp_path, "toy")
 
 
+@pytest.mark.slow
 def test_what_looks_like_masks_depth_or_a_lens_and_is_not_read_is_named(tmp_path):
     folder = write_video(tmp_path / "toy")
     assert len(read_scene(tmp_path, "toy").protocol["assumed"]) == 1  # the times alone

@@ -14,6 +14,7 @@ from forewarp.data.video import converted, doubts_of, extracted, header_of, stam
 from tests.support.films import numbered, write_film, write_planes
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("late", [0, 500])
 def test_frames_from_any_time_on_are_those_of_the_whole_video(tmp_path, late):
     film = write_film(tmp_path / "a.mp4", numbered(12), stamps=f"{late}+N*40+mod(N\\,2)*10")
@@ -48,6 +49,7 @@ def test_what_is_no_video_has_no_frames(tmp_path):
     assert list(extracted(tmp_path / "a.mp4", None, None)) == []
 
 
+@pytest.mark.slow
 def test_frames_that_were_cut_off_without_coding_anew_have_no_time(tmp_path):
     """They lie before the first frame that is shown, on which it depends."""
     film, cut = write_film(tmp_path / "a.mp4", numbered(12)), tmp_path / "cut.mp4"
@@ -59,6 +61,7 @@ def test_frames_that_were_cut_off_without_coding_anew_have_no_time(tmp_path):
     np.testing.assert_array_equal(shown[0], list(extracted(film, [5], None))[0])
 
 
+@pytest.mark.slow
 def test_of_several_streams_the_film_is_taken_not_a_cover_or_a_preview(tmp_path):
     film = write_film(tmp_path / "film.mp4", numbered(12))
     small = write_film(tmp_path / "small.mp4", numbered(3, size=(24, 32)))
@@ -129,6 +132,7 @@ def test_two_pictures_in_a_frame_are_refused_and_one_is_cut_out(tmp_path):
     assert next(extracted(tmp_path / "one.mp4", None, None)).shape == (48, 32, 3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["equirectangular", "half equirectangular", "cubemap", "fisheye"])
 def test_films_of_no_perspective_are_refused_and_turned_to_one(tmp_path, kind, monkeypatch):
     film = write_film(tmp_path / f"{kind[:4]}.mp4", numbered(1))

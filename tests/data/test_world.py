@@ -45,6 +45,7 @@ def test_of_nerfies_layout(tmp_path):
         np.testing.assert_allclose(place, camera["position"])
 
 
+@pytest.mark.slow
 def test_of_a_rig(tmp_path):
     cameras = fixed_cameras()
     write_multicam(tmp_path / "toy", cameras)
@@ -81,6 +82,7 @@ def near(camera, other):
     assert (camera.near, camera.far) == (pytest.approx(other.near), pytest.approx(other.far))
 
 
+@pytest.mark.slow
 def test_exact_scenes_far_from_the_origin_are_moved_to_it_in_their_unit(tmp_path):
     for name, move in (("here", 0.0), ("there", UTM)):
         folder = write_lego(tmp_path / name)

@@ -3,6 +3,7 @@
 import math
 from dataclasses import replace
 
+import pytest
 import torch
 
 from forewarp.data.batches import Targets
@@ -100,6 +101,7 @@ def measured(method, scene, targets):
     return test, reason, trust_of(method, scene, targets, numbers, drop_of(test))
 
 
+@pytest.mark.slow
 def test_a_wall_that_fakes_its_depth_is_crossed_out_and_trusted_nowhere():
     scene, targets = film()
     test, _, trust = measured(Wall(), scene, targets)
@@ -112,12 +114,14 @@ def test_a_wall_that_fakes_its_depth_is_crossed_out_and_trusted_nowhere():
     assert trust == {"degrees": 0.0, "rest": 0.0}
 
 
+@pytest.mark.slow
 def test_images_are_compared_in_their_own_light():
     scene, targets = film(gain=0.1)
     assert measured(Wall(gain=0.1), scene, targets)[0]["crossed"]["psnr"] > 50
     assert measured(Wall(), scene, targets)[0]["crossed"]["psnr"] < 35
 
 
+@pytest.mark.slow
 def test_what_moves_at_either_time_does_not_count():
     """A part of the wall is painted wrongly in all images but within the masks, which are grown."""
 
@@ -147,6 +151,7 @@ def spoil(image):
     return image
 
 
+@pytest.mark.slow
 def test_without_masks_or_times_far_away_it_says_why():
     assert measured(Wall(), *film(None))[:2] == ({}, "no mask says what moves")
     scene, targets = film()
@@ -159,6 +164,7 @@ def test_without_masks_or_times_far_away_it_says_why():
     assert measured(Wall(), *everything)[1] == "hardly any pixel rests"
 
 
+@pytest.mark.slow
 def test_what_stands_before_the_photo_ends_trust():
     scene, targets = film()
     trust = measured(Wall(near=0.9), scene, targets)[2]

@@ -72,6 +72,7 @@ def assert_same(a, b):
     assert all(torch.equal(value, b[key]) for key, value in a.items() if torch.is_tensor(value))
 
 
+@pytest.mark.slow
 def test_rows_of_the_held_out_views_lie_at_geometric_moments_and_at_the_end(watched):
     folder, module = watched
     rows = read_rows(folder / "accuracy_time.csv")
@@ -92,6 +93,7 @@ def test_rows_of_the_held_out_views_lie_at_geometric_moments_and_at_the_end(watc
         assert points == pytest.approx([float(row[column]) for row in rows], rel=1e-4)
 
 
+@pytest.mark.slow
 def test_it_changes_no_weight_and_its_seconds_do_not_count(watched, tmp_path, monkeypatch):
     seen = []
 
@@ -107,6 +109,7 @@ def test_it_changes_no_weight_and_its_seconds_do_not_count(watched, tmp_path, mo
     assert_same(run(tmp_path / "without", curve=False).fit(), watched[1])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "ends", [[Interrupt("coarse", 3), Crash(5)], [Crash(5)]], ids=["work lost", "all lost"]
 )
@@ -118,6 +121,7 @@ def test_a_continued_run_continues_its_rows(tmp_path, watched, ends):
     assert steps(tmp_path) == EXPECTED
 
 
+@pytest.mark.slow
 def test_seconds_add_up_over_stages_and_a_stage_not_noted_gets_no_second_last_row(tmp_path):
     run(tmp_path, stages=("coarse", "fine")).fit()
     (tmp_path / "fine" / "done.json").unlink()
@@ -127,6 +131,7 @@ def test_seconds_add_up_over_stages_and_a_stage_not_noted_gets_no_second_last_ro
     assert [round(s, -3) for s in seconds[-2:]] == [8000, 14000]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("views", [0, 1])
 def test_a_run_with_validation_views_has_a_curve_and_no_other(tmp_path, views):
     run(tmp_path, held_out=0, scene=lambda: replace(scene_with_truth(views), truth=None)).fit()
@@ -184,6 +189,7 @@ def aimed(folder, *more, target=THIRTY, stages=("coarse",)):
     return made
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ends", [[], [Interrupt("coarse", 3)], [Interrupt("coarse", 5)], [Crash(4)]])
 def test_two_rows_in_a_row_at_the_target_end_the_stage_also_of_a_continued_run(tmp_path, each_step, ends):
     each_step(20, 31, 29, 30, 32, 33, 34)
@@ -202,6 +208,7 @@ def test_two_rows_in_a_row_at_the_target_end_the_stage_also_of_a_continued_run(t
     assert said[-1].endswith("step 4 of the stage, with 30.00 dB of views not trained on (target.psnr=30)")
 
 
+@pytest.mark.slow
 def test_a_target_that_is_not_reached_is_said_and_the_budget_ends_training(tmp_path, each_step):
     each_step(20, 31, 29, 30, 29, 31, 29)
     made, said = aimed(tmp_path), []
@@ -211,6 +218,7 @@ def test_a_target_that_is_not_reached_is_said_and_the_budget_ends_training(tmp_p
     assert said == ["coarse: target.psnr=30 not reached within the budget"]
 
 
+@pytest.mark.slow
 def test_only_the_last_stage_is_ended(tmp_path, each_step):
     each_step(31, 31, 31, 31, 31, 31, 31)
     made = aimed(tmp_path, stages=("coarse", "fine"))
@@ -218,6 +226,7 @@ def test_only_the_last_stage_is_ended(tmp_path, each_step):
     assert {name: done["steps"] for name, done in made.finished().items()} == {"coarse": 7, "fine": 2}
 
 
+@pytest.mark.slow
 def test_a_plateau_is_two_doublings_in_a_row_that_gain_little(tmp_path, each_step):
     # Gains since half the steps: 2 of step 4 (from 22), 1.2 of 5 (from 22.8), 0.5 of 6 (from 23.5).
     each_step(20, 22, 23.5, 24, 24, 24, 24)
@@ -227,6 +236,7 @@ def test_a_plateau_is_two_doublings_in_a_row_that_gain_little(tmp_path, each_ste
     assert (done["reached"], done["step"], done["held_out_psnr"]) == ("target.plateau", 5, 24.0)
 
 
+@pytest.mark.slow
 def test_a_curve_that_is_flat_where_the_budget_ends_has_reached_no_plateau(tmp_path, each_step):
     # Gains since half the steps: 2.7 of step 5, 1.0 of 6 (from 23.5), 0.7 of 7, the last of the stage.
     each_step(20, 22, 23.5, 24, 25.5, 24.5, 24.5)

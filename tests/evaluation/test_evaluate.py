@@ -50,6 +50,7 @@ def module(run):
     return run.fit()
 
 
+@pytest.mark.slow
 def test_fewer_views_are_evenly_spread_and_named(run, module, tmp_path):
     evaluate(module, run.datamodule, tmp_path, ImageSuite())
     (tmp_path / "images" / "mine.png").touch()
@@ -62,6 +63,7 @@ def test_fewer_views_are_evenly_spread_and_named(run, module, tmp_path):
     assert metrics["test"]["all"]["psnr"] == pytest.approx(sum(row["scores"]["psnr"] for row in rows) / 2)
 
 
+@pytest.mark.slow
 def test_scores_every_image_and_saves_it(run, module, tmp_path):
     seen = []
     more = {"finished": run.finished(), "sheets": 2, "progress": lambda *done: seen.append(done)}
@@ -103,6 +105,7 @@ def test_depth_is_drawn_in_the_colours_of_the_true_one(run, module, tmp_path):
     assert iio.imread(tmp_path / "depth" / "t_0.png").shape == (312, 3 * 312 + 2 * 4, 3)
 
 
+@pytest.mark.slow
 def test_a_network_is_described_beside_the_numbers(tmp_path):
     changes = {"inpainter": INPAINTER, "upsampler": partial(LearnedUpsampler, width=8)}
     run = make_run(tmp_path, [stage(iterations=1)], model=forward_model(**changes))
@@ -113,6 +116,7 @@ def test_a_network_is_described_beside_the_numbers(tmp_path):
     assert sum(step["parameters"] for step in steps) == sum(map(parameter_count, own))
 
 
+@pytest.mark.slow
 def test_what_moves_is_scored_apart(run, module, tmp_path, capsys):
     def masked(frame, mask):
         return replace(frame, load_moving=lambda: mask)

@@ -57,6 +57,7 @@ def test_images_are_reduced_and_compare_with_the_truth(module):
     torch.testing.assert_close(right, error_colors(left, middle))
 
 
+@pytest.mark.slow
 def test_the_validation_psnr_is_a_mean_over_images_that_draws_nothing_global(module):
     targets = ball_data(frames=2, size=32).targets("test")
     whole = validation_psnr(module, targets, rays=32 * 32)

@@ -171,6 +171,7 @@ def test_the_shape_of_a_known_ball_is_off_by_less_than_a_pixel():
     assert shape_error(module, ball_scene()) is None
 
 
+@pytest.mark.slow
 def test_pictures_of_a_known_motion_are_those_of_its_truth(tmp_path):
     data = known_data()
     entries = measure_motion(known_ball(), data, tmp_path, pictures=True)

@@ -57,6 +57,7 @@ def load(source, tmp_path, **options):
         return about, *(dict(stack.enter_context(file)) for file in files)
 
 
+@pytest.mark.slow
 def test_voxels_go_where_the_method_says_and_are_seen_from_their_side(ball, tmp_path):
     about, tracks, method = load(ball, tmp_path, points=150, views=3)
     points = torch.from_numpy(tracks["points"])

@@ -255,6 +255,7 @@ def meshes(folder, files="ply"):
     return [trimesh.load(folder / f"mesh_{i:04d}.{files}", process=False) for i in range(len(TIMES))]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("files", ["ply", "obj"])
 def test_the_ball_is_where_it_is_at_each_time(ball, tmp_path, files):
     ball.method.bounds = lambda times: BOX
@@ -270,6 +271,7 @@ def test_the_ball_is_where_it_is_at_each_time(ball, tmp_path, files):
         assert abs(shown - painted.numpy()).max() < 0.03
 
 
+@pytest.mark.slow
 def test_it_can_be_turned_upright(ball, tmp_path):
     ball.method.bounds = lambda times: BOX
     for up in ("world", "-y"):
@@ -314,6 +316,7 @@ def test_ellipsoids_on_a_lattice_are_those_one_by_one(monkeypatch):
         np.testing.assert_allclose(colors.reshape(-1, 3)[some], wanted[1][some], atol=0.05)
 
 
+@pytest.mark.slow
 def test_particles_have_their_opacity_at_the_vertices(particles, tmp_path):
     about = export_mesh(particles, tmp_path / "mesh", level=0.4)
     for mesh, time in zip(meshes(tmp_path / "mesh"), TIMES):

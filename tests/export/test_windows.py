@@ -86,6 +86,7 @@ def image(film, camera, time):
     return torch.lerp(*seen, share).reshape(camera.height, camera.width, 3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("quality", "least"), [("lossless", 60.0), ("compact", 35.0)])
 def test_each_time_is_drawn_by_its_window(film, written, quality, least):
     file, facts = written(quality)
@@ -124,6 +125,7 @@ def test_windows_that_began_from_another_run_are_refused(film):
         shared_in([film, retrained])
 
 
+@pytest.mark.slow
 def test_the_page_suffices_to_draw_a_film(film, written):
     file, _ = written()
     scene = forewarp.load(file)

@@ -78,6 +78,7 @@ def of_npz(folder):
 PLACES = {"ply": of_ply, "glb": of_glb, "usd": of_usd, "mesh": of_mesh, "gltf": of_gltf, "npz": of_npz}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("world", [ROOM, UTM, MILLIMETRES], ids=["room", "UTM", "mm"])
 @pytest.mark.parametrize("kind", PLACES)
 def test_places_are_those_of_the_data(particles, tmp_path, kind, world):
@@ -102,6 +103,7 @@ def test_places_are_those_of_the_data(particles, tmp_path, kind, world):
         assert about.get(key) == (pytest.approx(before[key] / world.scale) if key in before else None)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["ply", "usd", "mesh"])
 def test_turned_places_turn_back_by_the_rotation_of_about(particles, tmp_path, kind):
     if kind == "usd":

@@ -2,6 +2,7 @@
 
 import math
 
+import pytest
 import torch
 
 from forewarp.fields.occupancy import Occupancy
@@ -45,6 +46,7 @@ def test_all_matter_of_all_times_is_kept_and_most_of_the_rest_is_not():
     assert other(POINTS).equal(lattice(POINTS))
 
 
+@pytest.mark.slow
 def test_what_is_gone_is_forgotten():
     lattice, draw = looked([0.0], 40), torch.Generator().manual_seed(2)
     for _ in range(300):

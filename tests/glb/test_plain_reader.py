@@ -37,6 +37,7 @@ def assert_alike(plain, scene, cameras, least=70):
             assert least < 70 or abs(error).max() < 2 / 255
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("curve", "without", "numbers"),
     [

@@ -209,6 +209,7 @@ def test_weights_of_offsets_do_not_depend_on_what_is_skipped():
     assert 0 < found[1][0] < 0.9 * found[0][0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_dead_start_is_named(kind):
     marchings = (Marching(color_threshold=threshold) for threshold in (1e-3, 0.9))

@@ -63,6 +63,7 @@ def points_in_double(count):
     return torch.randn(count, 3, generator=torch.Generator().manual_seed(1)).double()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "changes"), [*((kind, {}) for kind in KINDS), ("dnerf", {"continuous": True})]
 )
@@ -72,6 +73,7 @@ def test_gradients_of_a_field_against_differences(kind, changes):
     assert gradcheck(lambda x, *_: shown(made, 0.75, x), (points, *made.parameters()), fast_mode=True)
 
 
+@pytest.mark.slow
 def test_gradients_of_the_regularisers_against_differences():
     made = double_and_narrow("nerfies")
     points, warp = points_in_double(4), made.warp
@@ -157,6 +159,7 @@ def test_a_dead_start_is_named(kind, options, kill, advice):
         made.look(batch(), {"photo": 1.0}, generator)
 
 
+@pytest.mark.slow
 def test_a_start_that_comes_alive_is_none():
     made, generator = method("tnerf"), draw()
     for step in range(40):
@@ -351,6 +354,7 @@ def test_the_elastic_term_of_a_warp_that_scales(factor):
     assert_close(warp.elastic(points, torch.zeros(2), 1.0), expected, rtol=1e-4, atol=0)
 
 
+@pytest.mark.slow
 def test_the_elastic_term_is_summed_over_coarse_samples_and_averaged_over_rays():
     made, generator = liven(skipping("nerfies", elastic_samples=None)), draw()
     seen = made.along(Moment(0.5), View(camera()).rays(), WHITE, generator)

@@ -99,6 +99,7 @@ def masked_mean(image, mask, axis):
     return np.moveaxis(means, -1, axis), np.moveaxis(some, -1, axis)
 
 
+@pytest.mark.slow
 def test_masked_ssim_is_its_twin():
     a, b, mask = noise(23, 27, 3), noise(23, 27, 3, seed=1), torch.zeros(23, 27)
     mask[3:9, 2:15] = mask[20:, 20:] = 1

@@ -67,6 +67,7 @@ def test_heads_of_torchmetrics_are_version_0_1(squeeze):
         assert torch.equal(head, squeeze.state_dict()[f"head{k}"])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("net", "parameters", "taps"),
     [
@@ -87,6 +88,7 @@ def test_architectures(net, parameters, taps):
     assert widths == taps == [head.shape[1] for head in lpips.heads_of(net)]
 
 
+@pytest.mark.slow
 def test_is_its_twin(alex_file):
     net = LPIPS("alex", alex_file)
     first, second = images()
@@ -127,6 +129,7 @@ def test_equal_and_white_images_are_at_no_distance(alex_file):
     assert not any(p.requires_grad for p in net.parameters())
 
 
+@pytest.mark.slow
 def test_whole_model_files_are_read(alex_file, tmp_path):
     bare = torch.load(alex_file, weights_only=True)
     whole = {f"features.{key}": value for key, value in bare.items()}

@@ -40,6 +40,7 @@ def alex(tmp_path):
     return LPIPS("alex", tmp_path / "alexnet.pth")
 
 
+@pytest.mark.slow
 def test_scores_are_the_metrics_in_fixed_order(alex):
     true = target(170, 180, depth=torch.full((170, 180), 2.0))
     prediction = (true.rgb + 0.1).clamp(0, 1)
@@ -53,6 +54,7 @@ def test_scores_are_the_metrics_in_fixed_order(alex):
     assert [scores[f"depth_delta_{ratio}"] for ratio in ("1.02", "1.25", "1.5625")] == [0.0, 1.0, 1.0]
 
 
+@pytest.mark.slow
 def test_what_training_images_show_too_is_scored_apart(alex):
     covisible = torch.zeros(34, 40, dtype=torch.bool)
     covisible[3:30, 4:9] = True

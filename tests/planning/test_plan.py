@@ -41,6 +41,7 @@ def words(scenes, in_tmp):
     return [*VOXELS, *TINY, f"data.root={scenes}", "data.scene=vehicle"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("model", [["model=particles"], VOXELS])
 def test_a_plan_is_made_once_told_and_fitted(forewarp, ok, scenes, monkeypatch, in_tmp, model):
     kept = SceneDataModule.targets
@@ -96,6 +97,7 @@ def made(forewarp, stills, in_tmp):
     return plan
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("method", "model", "steps"),
     [(Particles, ["model=particles"], 30), pytest.param(ForwardWarp, VOXELS, 10, marks=pytest.mark.slow)],
@@ -116,6 +118,7 @@ def test_a_plan_depends_neither_on_the_budget_nor_on_the_clock(made, monkeypatch
             assert hasty[key] == plan[key], key
 
 
+@pytest.mark.slow
 def test_a_run_with_a_target_is_planned_by_a_still_fit_without(forewarp, stills, in_tmp, monkeypatch):
     targets = []
     monkeypatch.setattr(planning, "build_run", lambda c: targets.append(plain(c.target)) or build_run(c))
@@ -125,6 +128,7 @@ def test_a_run_with_a_target_is_planned_by_a_still_fit_without(forewarp, stills,
     assert (done.status, targets) == (0, [{"psnr": 60, "plateau": None}, None]), done.err
 
 
+@pytest.mark.slow
 def test_what_is_typed_changes_no_evidence(made, monkeypatch):
     monkeypatch.setattr(Particles, "still_steps", 20)
     plan, _ = made("auto", "model=particles")
@@ -135,6 +139,7 @@ def test_what_is_typed_changes_no_evidence(made, monkeypatch):
     assert "fit" not in made("all", "model=particles", *every)[0]  # nothing is left to decide
 
 
+@pytest.mark.slow
 def test_a_method_that_names_no_steps_keeps_its_preset(made, monkeypatch):
     monkeypatch.setattr(Particles, "still_steps", None)
     plan, printed = made("none", "model=particles")
@@ -187,6 +192,7 @@ def test_specimens_get_what_they_call_for(ok, specimens, in_tmp, model, scene, w
     assert {name for name in judged if effects[name]["on"]} == wanted & judged
 
 
+@pytest.mark.slow
 def test_a_sweep_plans_the_method_of_its_file(ok, scenes, in_tmp):
     scene = [*TINY, f"data.root={scenes}", "data.scene=vehicle", "hydra.sweeper.scenes=['seed=1']"]
     short = [*VOXELS[1:], "budget.iterations=4", "budget.minutes=null", "evaluate=false"]
@@ -196,6 +202,7 @@ def test_a_sweep_plans_the_method_of_its_file(ok, scenes, in_tmp):
     assert (made["overrides"][0], made["effects"]["motion"]["choice"]) == ("model=forward", "dct")
 
 
+@pytest.mark.slow
 def test_whole_images_get_the_effects_of_whole_images(ok, scenes, in_tmp, monkeypatch):
     monkeypatch.setattr("forewarp.methods.effect.CUT_OUT", 2.0)
     typed = ["model=forward", *TINY, f"data.root={scenes}", "data.scene=vehicle"]
@@ -275,6 +282,7 @@ def test_a_plan_may_say_that_runs_lie_where_it_does(tmp_path):
     assert word in read_plan(tmp_path / "x" / "plan.yaml")["typed"]
 
 
+@pytest.mark.slow
 def test_what_a_plan_composes_names_no_code_of_others(refused, in_tmp):
     """Whatever words lead there: the config of a planned run is looked at before anything is made of it."""
     mine = in_tmp / "mine" / "experiment"

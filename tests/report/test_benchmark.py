@@ -184,6 +184,7 @@ def timed(runs, method, minutes, *found, scene="ball", clock="wall", took=None):
         write_run(runs / method, **named, metrics=metrics, config={"model": {"name": method}})
 
 
+@pytest.mark.slow
 def test_methods_are_compared_over_lengths(tmp_path, monkeypatch):
     out, beside, draw = tmp_path / "out", [], figures.draw_lengths
     monkeypatch.setattr(figures, "draw_lengths", lambda *given: beside.append(given[3]) or draw(*given))
@@ -267,6 +268,7 @@ def method_run(root, name, psnr, *, seed=0, minutes=5.0, steps=None, sheets=Fals
     return folder
 
 
+@pytest.mark.slow
 def test_methods_are_ranked_and_what_they_depart_from_is_listed_once(tmp_path, monkeypatch):
     monkeypatch.setattr(figures, "save", SAVE)
     runs, out = tmp_path / "runs", tmp_path / "out"
@@ -303,6 +305,7 @@ def test_methods_are_ranked_and_what_they_depart_from_is_listed_once(tmp_path, m
         assert any(abs(red - 7 * psnr) < 4 for red in reds) == there, psnr  # tnerf has no sheets
 
 
+@pytest.mark.slow
 def test_methods_that_cannot_be_told_apart_share_the_mark_of_the_best(tmp_path):
     found = {"forward": (30.0, 30.1, 30.2), "particles": (30.1, 30.0, 30.2), "ndvg": (20.0, 20.1, 20.2)}
     for name, psnr in (found | {"tnerf": (40.0,)}).items():  # one seed, however good, is not ranked
@@ -336,6 +339,7 @@ def test_later_runs_are_added_and_runs_under_other_conditions_have_their_own_tab
     assert "](faithful-step.md)" in text
 
 
+@pytest.mark.slow
 def test_a_picture_of_more_methods_stays(tmp_path):
     for name in ("forward", "ndvg"):
         method_run(tmp_path / "runs", name, 25.0, sheets=True)

@@ -90,6 +90,7 @@ def test_runs_that_miss_the_target_that_all_had_are_counted(tmp_path):
     assert rows_of(text, "24")[0][1:3] == ["27.6 ± 10.9", "base"]
 
 
+@pytest.mark.slow
 def test_a_winner_is_named_where_three_seeds_show_it_and_else_who_shares_the_row(tmp_path):
     rows = (2, 20.5), (8, 24.5), (16, 26.0), (20, 26.0)
     for seed, factor in enumerate((100, 110, 90)):

@@ -30,6 +30,7 @@ def of(method, scores=None, protocol=None, **more):
     return about | more
 
 
+@pytest.mark.slow
 def test_runs_side_by_side_with_their_difference(ok, runs, monkeypatch):
     monkeypatch.setitem(METRICS, "mean_error", Metric("mean_error", "Mean error", 3))
     scores = {"psnr": 30.0, "lpips_vgg": 0.1, "mean_error": 0.25, "depth_delta_1.25": 1.0}
@@ -70,6 +71,7 @@ def test_conditions_in_which_runs_differ_are_told_and_what_one_lacks_has_no_row(
     assert rows["views held out"] == ["none named", "8", None]
 
 
+@pytest.mark.slow
 def test_other_scenes_have_no_difference_and_other_kinds_of_view_no_metrics(ok, in_tmp):
     flow = {"flow": {"epe_moving": 0.1, "motion_mean": 0.4}}
     space = {"test": {"space": {"psnr": 20.0}}}
@@ -85,6 +87,7 @@ def test_other_scenes_have_no_difference_and_other_kinds_of_view_no_metrics(ok, 
     assert last.endswith("measured in all runs (ball/base-1.0-seed0: all; cone/base-1.0-seed0: space)")
 
 
+@pytest.mark.slow
 def test_a_view_is_drawn_by_every_run_that_has_it(ok, runs, in_tmp):
     for run in runs(one=of("particles"), two=of("forward"), three=of("backward")):
         views = {f"test/{name}": (0.5, 30.0) for name in ("ab" if run != "three" else "b")}

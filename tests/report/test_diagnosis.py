@@ -119,6 +119,7 @@ def smooth(generator, times, count):
     return generator.standard_normal((count, len(times))) @ np.linalg.cholesky(covariance).T
 
 
+@pytest.mark.slow
 def test_errors_that_are_smooth_in_time_seldom_make_a_finding(tmp_path):
     row, generator, runs = read_story(told_run(tmp_path, steps=1_000_000)), np.random.default_rng(0), 200
     times, blurs = np.linspace(0, 1, 40).tolist(), [f"_{sigma:g}" for sigma in SIGMAS]
@@ -276,6 +277,7 @@ MODELS = [path.stem for path in (CONF / "model").glob("*.yaml") if path.stem != 
 FAST = ("forward", "fast"), ("particles", "fast")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("model", "preset"),
     [
@@ -303,6 +305,7 @@ def test_every_key_to_try_composes_for_its_model_and_changes_something(model, pr
             assert value_at(changed, path) != value_at(config, path), key
 
 
+@pytest.mark.slow
 def test_a_limit_of_steps_composes():
     words = "experiment=multicam", "data.scene=x", "model=particles"
     config = OmegaConf.to_container(composed(*words), resolve=True)

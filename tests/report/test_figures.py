@@ -26,6 +26,7 @@ def test_the_front_is_what_nothing_beats_in_both():
     assert pareto_front([(1, 20), (2, 19), (2, 22), (3, 22), (4, 30), (4, 29)]) == [0, 2, 4]
 
 
+@pytest.mark.slow
 def test_a_run_is_drawn_with_its_flow_error_below(tmp_path):
     heights = []
     for variant, epe in (("flat", None), ("both", 0.5)):

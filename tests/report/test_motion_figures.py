@@ -97,6 +97,7 @@ def test_runs_at_another_place_are_left_out(tmp_path):
     assert len(Flows(runs_of(tmp_path)).runs) == 1
 
 
+@pytest.mark.slow
 def test_every_figure_is_drawn_and_its_table_written(tmp_path):
     for method in ("forward", "backward", "dnerf", "tineuvox_s"):
         follows = method in ("forward", "backward")
@@ -134,6 +135,7 @@ def test_every_figure_is_drawn_and_its_table_written(tmp_path):
     assert {row["curves of"] for row in rows[1:]} == {"forward", "backward", "dnerf", "tineuvox_s"}
 
 
+@pytest.mark.slow
 def test_the_papers_page_shows_them(tmp_path):
     for method in ("forward", "backward"):
         motion_run(tmp_path / "runs", method, 0, stored(backward=TRUE, forward=TIMES))
@@ -145,6 +147,7 @@ def test_the_papers_page_shows_them(tmp_path):
         assert f"](paper-{name}-vehicle.png)" in page
 
 
+@pytest.mark.slow
 def test_a_scene_without_true_motion_has_pictures_of_its_own(tmp_path):
     left = dict.fromkeys(
         ["times", "place", "true_backward", "true_forward", "shots", "true_paths", "true_depth"]

@@ -62,6 +62,7 @@ def cells(table, name=OURS, kind="measured"):
     return table.texts("md")[at][of_kind + 1 : -len(COSTS)]
 
 
+@pytest.mark.slow
 def test_a_mean_is_of_all_scenes_or_empty(tmp_path):
     for number, scene in enumerate(ALL[:7]):
         paper_run(tmp_path, scene, psnr=20.0 + number)
@@ -76,6 +77,7 @@ def test_a_mean_is_of_all_scenes_or_empty(tmp_path):
     assert cells(table_of(tmp_path), kind="difference to the paper") == ["-9.18", "-0.070", ""]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("protocol", [{"half_resolution": True}, {"scale": 4}])
 def test_no_mean_is_taken_over_unlike_images(tmp_path, protocol):
     for scene in ALL:
@@ -86,6 +88,7 @@ def test_no_mean_is_taken_over_unlike_images(tmp_path, protocol):
     assert (values[6], values[9]) == ("", "30.00")  # of hook, whose images are others; of bouncingballs
 
 
+@pytest.mark.slow
 def test_seeds_give_an_interval_where_all_scenes_have_them(tmp_path):
     for seed, psnr in ((0, 20.0), (1, 22.0), (2, 21.0)):
         for scene in ALL:
@@ -112,6 +115,7 @@ def test_some_training_views_neither_replace_nor_join_all_of_them(tmp_path):
     assert "is newer" not in text
 
 
+@pytest.mark.slow
 def test_ranks_are_among_measured_rows_alone(tmp_path):
     for variant, psnr, lpips in (("full", 25.0, 0.2), ("no_tv", 24.0, 0.1), ("no_view", 20.0, 0.3)):
         for scene, seed in product(ALL[:4], range(3)):
@@ -169,6 +173,7 @@ def whole(tmp_path):
     return tmp_path / "out"
 
 
+@pytest.mark.slow
 def test_pages_tell_how_numbers_came_about(whole):
     text = (whole / "paper.md").read_text()
     for line in (
@@ -278,6 +283,7 @@ def test_runs_of_no_table_are_said_to_be_left_out(tmp_path, capsys):
     assert f"* {line}\n" in (tmp_path / "out" / "paper.md").read_text().split("## Left out")[1]
 
 
+@pytest.mark.slow
 def test_counterparts_never_meet_printed_numbers(tmp_path):
     paper_run(tmp_path, "vehicle", made=True, psnr=28.0)
     paper_run(tmp_path, "lift", dataset="lego_complete", protocol={"synthetic": True})  # however it is read
@@ -308,6 +314,7 @@ SYSTEMS = {"dnerf": GRIDS | {"tnerf", "dnerf"}, "nhr": GRIDS, "lego_complete": {
 SYSTEMS["hypernerf"] = GRIDS | {"nerf", "neural_volumes", "nerfies", "hypernerf"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dataset", SYSTEMS)
 def test_every_system_stands_beside_its_published_row(tmp_path, dataset):
     table, models = read_paper(PAPER)[dataset], set(options("model"))
@@ -330,6 +337,7 @@ def test_every_system_stands_beside_its_published_row(tmp_path, dataset):
         assert all(line[first:]) == any(line[first:]) == (model in SYSTEMS[dataset]), model
 
 
+@pytest.mark.slow
 def test_rows_of_other_views_or_another_clock_stand_apart(tmp_path):
     few = {"measured": "5 of 20 test views, evenly spread"}
     for seed, protocol in enumerate(({}, few)):
@@ -352,6 +360,7 @@ def test_rows_of_other_views_or_another_clock_stand_apart(tmp_path):
     assert str(new) not in text
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("change", "marked"),
     [({}, True), ({"threads": 1}, False), ({"clock": "processor"}, False), ({"device": "a gpu"}, False)],
@@ -445,6 +454,7 @@ def test_the_page_says_which_of_the_papers_orders_hold(tmp_path):
     assert len(table.splitlines()) == 1 + 3 * 7
 
 
+@pytest.mark.slow
 def test_runs_at_rest_stand_above_what_the_page_has_already(tmp_path):
     def rest(variant, seed, psnr, method="forward"):
         config = {"preset": {"name": "compact"}, "model": {"name": method}, "budget": {"iterations": 9}}
@@ -497,6 +507,7 @@ def test_a_row_with_fewer_seeds_says_so(tmp_path):
     assert rows_of(rows, "w/o flow L1")[0][3:5] == ["+0.15 ± 0.21", "no difference shown"]
 
 
+@pytest.mark.slow
 def test_scores_of_unknown_seeds_are_not_paired(tmp_path):
     for seed in range(3):
         for variant, change in (("full", 0.0), ("no_tv", -1.0)):
@@ -517,6 +528,7 @@ def test_scores_of_unknown_seeds_are_not_paired(tmp_path):
         assert text.count("Which seed has which score was not kept") == 1
 
 
+@pytest.mark.slow
 def test_kinds_of_test_views_and_scenes_have_sections_of_their_own(tmp_path):
     for variant, changes in (("full", (0.0, 0.0, 0.0)), ("no_inpainter", (-1.0, 1.0, 0.5))):
         views = {kind: 25.0 + change for kind, change in zip(("space", "time", "canonical"), changes)}
@@ -612,6 +624,7 @@ def illustrated(tmp_path):
     return tmp_path / "out", write_paper(runs, tmp_path / "out")
 
 
+@pytest.mark.slow
 def test_every_figure_stands_on_each_page_with_a_caption(illustrated):
     out, files = illustrated
     scenes = ("views-hypernerf-vrig-chicken", "views-lego_complete-lift", "ablation-lift", "inpainter")

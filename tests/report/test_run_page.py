@@ -276,6 +276,7 @@ def test_a_broken_file_ends_in_one_line(tmp_path, file, content, says):
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.slow
 def test_losses_are_against_the_clock_of_training(fitted):
     row = read_story(fitted)
     ends = [points[-1][0] for points in row["loss"].values()]
@@ -294,6 +295,7 @@ def test_one_view_is_the_best_of_all():
     ]
 
 
+@pytest.mark.slow
 def test_of_many_views_some_are_drawn_and_the_lowest_too(tmp_path):
     folder = told_run(tmp_path, views=1500)
     change_scores(folder, {1: {"psnr": 3.0}})
@@ -363,6 +365,7 @@ def run(fitted, tmp_path_factory):
     return folder
 
 
+@pytest.mark.slow
 def test_the_command_renders_the_telling_views(ok, run, tmp_path):
     done = ok("report", "kind=run", f"run={run}", f"out={tmp_path}/shown.html")
     *told, written, link = done.out.strip().splitlines()
@@ -434,6 +437,7 @@ def test_a_missing_video_is_made_as_forewarp_render_does(ok, run, tmp_path, monk
     assert "Once around the scene at one time." in Page((tmp_path / "page.html").read_text()).text
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("error", "status", "says"),
     [
@@ -457,6 +461,7 @@ def test_what_was_rendered_before_an_error_or_an_interrupt_is_shown(
     assert "video" not in page.tags
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("typed", "device"), [([], "cpu"), (["trainer=gpu"], "gpu")])
 def test_a_run_keeps_its_trainer_unless_one_is_named(ok, run, tmp_path, monkeypatch, typed, device):
     seen = []
@@ -470,6 +475,7 @@ def test_a_run_keeps_its_trainer_unless_one_is_named(ok, run, tmp_path, monkeypa
     assert seen == [device]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("arguments", "line"),
     [

@@ -46,6 +46,7 @@ def multirun(root, found=FOUND, key=RIGID, metrics=None, **more):
     return root
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("write", [write_accuracy_time, write_paper, write_minutes, write_methods])
 def test_two_settings_are_two_rows_of_two_seeds(tmp_path, write):
     text = write(multirun(tmp_path / "runs"), tmp_path / "out")[0].read_text()
@@ -80,6 +81,7 @@ def test_choices_and_parts_of_the_method_are_not_pooled_either(tmp_path):
     ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("write", [write_accuracy_time, write_price_list])
 def test_runs_of_other_steps_or_views_are_no_seeds(tmp_path, write):
     for seed, more in enumerate(({"iterations": 100}, {"iterations": 200}, {"threads": 1})):

@@ -50,6 +50,7 @@ def test_pairs_are_by_view_and_count_once_a_run():
     assert paired_change([(run(31.0, a=32.0), {"psnr": 30.0})], "psnr") == Estimate(1.0)  # of a table
 
 
+@pytest.mark.slow
 def test_the_second_place_is_shared_as_the_first():
     scores = {"a": (30.0, 30.1, 30.2), "b": (20, 20, 20), "c": (20.1, 19.9, 20.0), "d": (0, 0, 0)}
     named = {name: dict(enumerate(values)) for name, values in scores.items()}
@@ -74,6 +75,7 @@ def chance(request):
     return drawn
 
 
+@pytest.mark.slow
 def test_without_a_difference_verdicts_are_wrong_in_one_case_of_twenty(chance):
     said = {"signs": [], "paper": [], "minutes": []}
     for one, other in chance(2):
@@ -88,6 +90,7 @@ def test_without_a_difference_verdicts_are_wrong_in_one_case_of_twenty(chance):
         assert 0.03 < wrong <= 0.07, page
 
 
+@pytest.mark.slow
 def test_without_a_difference_plans_are_seldom_above_or_below_the_best(chance):
     names, rows = ("auto", "base", "all_effects", "no_effects"), Runs()
     for trial, of_trial in enumerate(chance(4)):
@@ -99,6 +102,7 @@ def test_without_a_difference_plans_are_seldom_above_or_below_the_best(chance):
     assert 0.03 < sum(word != "no difference shown" for word in words) / TRIALS <= 0.07
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("noise", [[0.2], [2.0, 0.2], [0.2, 1.0]], ids=["equal", "one", "most"])
 @pytest.mark.parametrize("methods", [2, 6, 12])
 @pytest.mark.parametrize("seeds", [3, 5])

@@ -69,6 +69,7 @@ TABLES |= {"ablation-at-rest.csv": ablation, "forward.csv": partial(timed, write
 TABLES["methods.csv"] = partial(timed, write_methods)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("table", TABLES)
 def test_a_page_is_the_same_from_its_table(tmp_path, table):
     made = tmp_path / "made"

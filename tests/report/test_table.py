@@ -188,6 +188,7 @@ def test_seeds_are_one_column_and_differences_are_paired(tmp_path):
     assert "differences are paired by seed" in found.caption
 
 
+@pytest.mark.slow
 def test_commas_and_lists_are_typed_as_they_are(ok, in_tmp):
     multirun(in_tmp / "runs" / "mine", FOUND)
     for typed in ("metric=psnr,ssim", "metric=[psnr,ssim]"):
@@ -199,6 +200,7 @@ def test_commas_and_lists_are_typed_as_they_are(ok, in_tmp):
         ]
 
 
+@pytest.mark.slow
 def test_of_a_pattern_what_holds_no_run_is_left_out(ok, in_tmp):
     for seed in range(2):
         write_run("runs", "x", seed)
@@ -209,6 +211,7 @@ def test_of_a_pattern_what_holds_no_run_is_left_out(ok, in_tmp):
     assert "30.00 (30.00, 30.00)" in ok("report", "kind=table", "runs=runs/*").out
 
 
+@pytest.mark.slow
 def test_a_report_of_nothing_says_what_it_looked_for(refused, in_tmp):
     write_run("runs", psnr=None)
     (in_tmp / "runs" / "ball" / "base-1.0-seed0" / "accuracy_time.csv").unlink()

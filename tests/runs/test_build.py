@@ -69,6 +69,7 @@ def test_a_device_that_is_not_there_is_refused(machine, accelerator, text):
         device_for(on(accelerator))
 
 
+@pytest.mark.slow
 def test_training_and_evaluation_use_the_same_device(machine, tmp_path):
     machine(apple=True)  # which Lightning would take
     run = build.build_run(config_of("trainer=auto"))
@@ -76,6 +77,7 @@ def test_training_and_evaluation_use_the_same_device(machine, tmp_path):
     assert trainer.strategy.root_device == run.device == torch.device("cpu")
 
 
+@pytest.mark.slow
 def test_it_says_why_and_how_to_choose_the_gpu(machine):
     machine(cuda=True)
     config = config_of("model=particles", "trainer=auto")
@@ -94,6 +96,7 @@ def test_it_says_why_and_how_to_choose_the_gpu(machine):
     assert by_minutes[0] == by_minutes[1] != by_minutes[2]
 
 
+@pytest.mark.slow
 def test_what_was_trained_by_the_processor_clock_is_only_not_trained_on_a_gpu(machine):
     machine(cuda=True)
     run = build.build_run(config_of("model=forward", "trainer=gpu", "budget.clock=processor"))
@@ -101,6 +104,7 @@ def test_what_was_trained_by_the_processor_clock_is_only_not_trained_on_a_gpu(ma
         run.fit()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("precision", ["16-mixed", 16, "transformer-engine-float16"])
 def test_float16_is_refused(precision):
     text = f"trainer.precision: expected 32-true or bf16-mixed, .* but got {precision}; use"
@@ -154,11 +158,13 @@ def test_an_argument_of_the_trainer_that_would_be_overruled_is_refused(key, valu
         build.check_trainer(OmegaConf.create({"_target_": "lightning.Trainer", key: value}))
 
 
+@pytest.mark.slow
 def test_a_profiler_of_another_name_is_refused():
     with pytest.raises(ValueError, match="profiler: expected simple, advanced or null, but got 'slow'"):
         build.build_run(config_of("+trainer.profiler=slow"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stored", [False, True])
 @pytest.mark.parametrize("model", ["forward", "particles"])
 def test_hyperparameters_are_keys_and_values_as_they_are_typed_each_once(model, stored):
@@ -182,6 +188,7 @@ def test_hyperparameters_are_keys_and_values_as_they_are_typed_each_once(model, 
     assert plain(again) == plain(config)
 
 
+@pytest.mark.slow
 def test_hyperparameters_tell_apart_runs_of_another_target_or_start():
     typed = ["target.psnr=31", "start=/home/me/runs/still", "+preset.bases=4", "+preset.mine=${.bases}"]
     found, plainly = (build.hyperparameters(config_of(*words)) for words in (typed, []))
@@ -191,6 +198,7 @@ def test_hyperparameters_tell_apart_runs_of_another_target_or_start():
     }
 
 
+@pytest.mark.slow
 def test_runs_of_a_folder_share_decoded_frames(tmp_path, monkeypatch):
     def folder(run, runs="runs"):
         return build.frames_folder(OmegaConf.create({"run": str(run), "paths": {"runs": str(runs)}}))
@@ -207,6 +215,7 @@ def test_runs_of_a_folder_share_decoded_frames(tmp_path, monkeypatch):
     assert content_hash(config_of()) == content_hash(config_of("+data.disk_cache_bytes=1"))
 
 
+@pytest.mark.slow
 def test_a_target_that_cannot_end_anything_is_refused():
     assert not build.target_of(config_of()).is_set
     config = config_of("target.psnr=30")
@@ -226,6 +235,7 @@ def test_a_target_makes_another_run_and_none_is_as_before():
     assert content_hash(before) == content_hash(config) != content_hash(config_of("target.psnr=30"))
 
 
+@pytest.mark.slow
 def test_a_key_of_the_data_that_is_new_and_null_changes_no_hash():
     """Finished jobs are found again by the digits that they were named by before the key was there."""
     before = {

@@ -101,6 +101,7 @@ def test_what_is_no_plain_config_is_refused_in_one_line(text, said, trust):
 FROM_VIDEO = ["experiment=video_with_poses", "data.scene=x", "model=forward", "model/motion=dct_features"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("words", [["experiment=demo_hypernerf"], FROM_VIDEO])
 def test_what_we_write_ourselves_is_trusted(words):
     text = OmegaConf.to_yaml(OmegaConf.create(OmegaConf.to_container(composed(*words), resolve=True)))
@@ -153,6 +154,7 @@ NAMES = ["{a}", "null", "a=b", "~x", "-x", "[a]", "[a", "{", "'", "a'b", "a\\", 
 NAMES += [" a ", "true"]
 
 
+@pytest.mark.slow
 def test_odd_names_are_taken_as_typed():
     for name in NAMES:
         scene, run = map(typed, as_text([f"data.scene={name}", f"run=runs/{name}"]))
@@ -276,6 +278,7 @@ def test_what_is_no_name_of_a_package_is_refused(named, monkeypatch):
             trust_of()
 
 
+@pytest.mark.slow
 def test_sweeps_with_other_budgets_have_folders_of_their_own(in_tmp, monkeypatch):
     place = {"sweep": True}
     monkeypatch.setattr(config, "is_swept", lambda: place["sweep"])

@@ -26,6 +26,7 @@ def truth(data, tmp_path):
     return tmp_path / "truth"
 
 
+@pytest.mark.slow
 def test_images_of_a_run_have_its_scores_to_the_last_digit(tmp_path):
     run = make_run(tmp_path / "run", [stage(iterations=2)])
     own = evaluate(run.fit(), run.datamodule, tmp_path / "own", ImageSuite())

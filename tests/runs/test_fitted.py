@@ -29,6 +29,7 @@ from tests.support.configs import ROOT
 from tests.support.tiny_scene import ball_scene
 
 
+@pytest.mark.slow
 def test_a_run_is_opened_to_look_at_and_other_data_are_told(fitted, tmp_path, capsys):
     run = shutil.copytree(fitted, tmp_path / "run")
     config = saved_config(str(run), OmegaConf.create({"trust": []}))
@@ -44,6 +45,7 @@ def test_a_run_is_opened_to_look_at_and_other_data_are_told(fitted, tmp_path, ca
         assert f"warning: {run}/data.json: expected the data that the run was begun with" in said
 
 
+@pytest.mark.slow
 def test_the_script_of_the_docs_runs(fitted, in_tmp):
     page = ROOT / "docs" / "scripts.md"
     script = re.search(r"```python\n(.*?)```", page.read_text(), re.DOTALL)[1]
@@ -58,6 +60,7 @@ def test_the_script_of_the_docs_runs(fitted, in_tmp):
     assert made["pixels"].shape == (len(made["paths"]), 2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("behind", ["white", "black"])
 def test_a_frame_is_rendered_as_it_is_measured(fitted, tmp_path, behind):
     run = shutil.copytree(fitted, tmp_path / "run")
@@ -81,6 +84,7 @@ def test_a_frame_is_rendered_as_it_is_measured(fitted, tmp_path, behind):
     torch.testing.assert_close((over[0] - over[1])[unclipped], clear.expand(-1, -1, 3)[unclipped])
 
 
+@pytest.mark.slow
 def test_data_that_moved_are_named(fitted, tmp_path, monkeypatch):
     run = shutil.copytree(fitted, tmp_path / "run")
     shutil.copytree(fitted.parent / "scenes", tmp_path / "there")
@@ -93,6 +97,7 @@ def test_data_that_moved_are_named(fitted, tmp_path, monkeypatch):
     assert len(load("~/run", data_root=tmp_path / "there").cameras) == 6
 
 
+@pytest.mark.slow
 def test_poses_and_points_may_be_arrays_and_lists(fitted):
     scene = load(fitted)
     camera, point = scene.cameras[0], [[0.0, 0.1, 0.2]]
@@ -106,6 +111,7 @@ def test_poses_and_points_may_be_arrays_and_lists(fitted):
     assert paths[0].shape == (1, 2, 3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("ask", "says"),
     [
@@ -130,6 +136,7 @@ def test_what_cannot_be_asked_is_refused_in_a_line(fitted, ask, says):
         ask(load(fitted))
 
 
+@pytest.mark.slow
 def test_what_a_prompt_shows_is_short(fitted):
     scene = load(fitted)
     frame, data = scene.frames("test")[0], opened(scene.config)[0].datamodule
@@ -236,6 +243,7 @@ def test_without_views_there_is_none(forewarp, ok, scene, returned):
     ok("train", *sweep, *SMALL, "run=swept")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("word", ["test/psnr", "3", "[psnr]"])
 def test_another_metric_is_refused_with_a_list(refused, fitted, in_tmp, word):
     line = refused("train", *SMALL, f"data.root={fitted.parent / 'scenes'}", f"score={word}")

@@ -29,6 +29,7 @@ def sweep():
     constant.clear()
 
 
+@pytest.mark.slow
 def test_values_are_crossed_and_repeated_with_every_seed(sweep, monkeypatch):
     composed = []
     monkeypatch.setattr(jobs, "compose", lambda *a, **k: composed.append(a[1]) or compose(*a, **k))
@@ -44,6 +45,7 @@ def test_values_are_crossed_and_repeated_with_every_seed(sweep, monkeypatch):
     assert len(composed) == 2  # seeds share what was composed
 
 
+@pytest.mark.slow
 def test_changes_and_scenes_are_one_at_a_time(sweep):
     changes = "hydra.sweeper.changes=['','preset=fast']"
     config = sweep(*SMALL, "sweeps=price_list_particles", changes)
@@ -52,6 +54,7 @@ def test_changes_and_scenes_are_one_at_a_time(sweep):
     assert [job.preset.name for job in jobs_of(config)] == ["demo", "fast"]
 
 
+@pytest.mark.slow
 def test_a_sweep_is_told_by_its_jobs_in_a_few_lines_and_listed(sweep, monkeypatch, tmp_path):
     config = sweep(*SMALL, "model=particles,forward", f"run={tmp_path}/runs/${{model.name}}")
     done = tmp_path / "runs" / "forward"
@@ -70,6 +73,7 @@ def test_a_sweep_is_told_by_its_jobs_in_a_few_lines_and_listed(sweep, monkeypatc
     assert sorted(path.name for path in tmp_path.iterdir()) == ["runs"]
 
 
+@pytest.mark.slow
 def test_a_few_jobs_stand_for_many_unless_each_is_asked_for(sweep, monkeypatch):
     composed, read = [], []
     monkeypatch.setattr(jobs, "_MOST", 3)
@@ -86,12 +90,14 @@ def test_a_few_jobs_stand_for_many_unless_each_is_asked_for(sweep, monkeypatch):
     assert (len(composed), len(read)) == (4, 4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("word", ["target.plateau=-1", "budget.minutes=0"])
 def test_what_training_would_refuse_has_no_estimate(sweep, word):
     with pytest.raises(ValueError, match=f"{word.partition('=')[0]}: expected"):
         cost_of_sweep(sweep(*SMALL, word))
 
 
+@pytest.mark.slow
 def test_a_search_has_as_many_jobs_as_it_is_given(sweep):
     config = sweep(*SMALL, "evaluate=false")
     with read_write(config.hydra):

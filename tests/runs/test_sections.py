@@ -45,6 +45,7 @@ def folder(tmp_path):
     return tmp_path
 
 
+@pytest.mark.slow
 def test_a_folder_brings_a_method_and_its_numbers(folder):
     def mine(*words):
         return composed(f"hydra.searchpath=[file://{folder}]", "model=mine", "data.scene=x", *words)
@@ -63,6 +64,7 @@ def test_a_folder_brings_a_method_and_its_numbers(folder):
         mine("preset=demo")
 
 
+@pytest.mark.slow
 def test_a_folder_has_exceptions_of_our_methods_for_its_data(folder):
     words = [f"hydra.searchpath=[file://{folder}]", "data.scene=x"]
     config = composed(*words, "experiment=mine")
@@ -83,6 +85,7 @@ def test_options_are_listed_beside_files():
     assert "one" not in source.list("stage", ObjectType.CONFIG)
 
 
+@pytest.mark.slow
 def test_a_plain_value_is_that_of_the_groups_key():
     config = composed("model/rotation=none", "model/color_over_time=cosines")
     assert (config.model.rotation, config.model.color_over_time) == (None, 2)

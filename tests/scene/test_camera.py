@@ -194,6 +194,7 @@ def test_orbit_circles_at_the_same_height_and_distance():
     torch.testing.assert_close(views[2].center[:2], -start.center[:2])
 
 
+@pytest.mark.slow
 def test_a_swing_goes_as_far_as_cameras_stand_to_both_sides_and_comes_back():
     focus = torch.tensor([0.5, 0.0, 0.0], dtype=torch.float64)
 

@@ -167,6 +167,7 @@ CHECKS = {
 KERNELS = ("trilinear", "average_splat")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("operator", "numba"),
     [

@@ -83,6 +83,7 @@ def test_random_views(place, seed):
     check_close(parts(ours), parts(exact), 1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("logit", [-4.0, 0.0, 8.0])
 def test_thousands_on_one_pixel(place, logit):
     particles = one((0.09, 0.02, 0.0), scale=(1e-3, 2e-3, 3e-3), opacity=logit, color=(0.2, -0.1, 0.3))
@@ -96,6 +97,7 @@ def test_thousands_on_one_pixel(place, logit):
     check_close(parts(ours)[1:], parts(exact)[1:], 5e-3)
 
 
+@pytest.mark.slow
 def test_of_a_crowded_tile_the_nearest_are_drawn(place):
     """The kernel looks at 32,768 of a tile, the reference at all."""
     kernel = place.type == "cpu" and backend.numba_installed()
@@ -168,6 +170,7 @@ def test_splats_by_what_moves_nothing(degree, lens):
     assert gradcheck(numbers, leaves, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_places_behind_a_lens():
     """Of colour there is one coefficient, which no direction changes."""
     particles, warp, *bases = crowd(count=3, degree=0)

@@ -70,6 +70,7 @@ def check_sound(module, losses, scene, steps):
     assert all(plane.isfinite().all() for plane in (drawn.rgb, drawn.depth, drawn.opacity))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", HARD)
 def test_hard_scenes_train(tmp_path, name):
     scene, options = HARD[name]
@@ -100,6 +101,7 @@ BAD = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", BAD)
 def test_bad_beginnings_train(tmp_path, monkeypatch, name):
     """As a step too long may have left it; density control and new links come in between."""

@@ -36,6 +36,7 @@ ROOT = Path(__file__).parents[2]
 DOCUMENT = (ROOT / "docs" / "stability.md").read_text()
 
 
+@pytest.mark.slow
 def test_every_test_that_the_table_names_exists():
     named = re.findall(r"`(tests/[\w/]+\.py)(?:::(\w+))?`", DOCUMENT)
     assert len(named) > 40

@@ -48,6 +48,7 @@ def fit(folder, scene, iterations, weights=None, model=None, **changes):
     return make_run(folder, [fitting], data=data, model=model, callbacks=[diary]).fit(), diary.losses
 
 
+@pytest.mark.slow
 def test_no_term_of_the_loss_depends_on_the_unit_of_length(tmp_path):
     """With all terms on, the first steps are equal except for rounding."""
     weights = dict.fromkeys(VoxelMethod.terms, 0.1)
@@ -103,6 +104,7 @@ HARD = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", HARD)
 def test_hard_scenes_train(tmp_path, name):
     scene, options = HARD[name]

@@ -122,6 +122,7 @@ def test_the_unet_on_any_volume(device, size, value, precision):
     check_finite(out, dense, *(p for p in net.parameters()))
 
 
+@pytest.mark.slow
 def test_half_precision_reads_only_what_was_written(device):
     """Torch's bfloat16 gradient of the weights reads unwritten memory for volumes two voxels deep."""
     net = UNet3d(channels=4, width=16, levels=3).to(device)

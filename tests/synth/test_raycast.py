@@ -86,6 +86,7 @@ def test_points_are_on_the_outside_and_spread_by_area(motion):
     assert 0.15 < way[way > 0].mean() < 0.6
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["threads", pytest.param("processes", marks=pytest.mark.slow)])
 def test_the_number_of_processes_does_not_matter(monkeypatch, world, kind):
     """And an error in a process is the caller's. Threads take the processes' place, which start slowly."""

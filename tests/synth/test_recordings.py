@@ -53,6 +53,7 @@ def heard(path):
     return np.frombuffer(raw, "<i2") / 32768
 
 
+@pytest.mark.slow
 def test_films_hold_the_true_frames_at_the_true_rates(made, truth, scene):
     frames = {frame.name: frame for frame in (*scene.train, *scene.test)}
     assert len(frames) == CAMERAS * FRAMES
@@ -103,6 +104,7 @@ def test_all_cameras_hear_one_clap_at_its_true_time(made, truth):
         assert 0.003 < before.std() < 0.03
 
 
+@pytest.mark.slow
 def test_a_synchronised_rig_is_in_the_layout_of_dynerf(tmp_path):
     arguments = {"cameras": 2, "frames": 2, "size": 32, "samples_per_pixel": 1, "workers": 1}
     synthesize_multicam(tmp_path / "rig", **arguments, synchronised=True)
@@ -120,6 +122,7 @@ def test_a_synchronised_rig_is_in_the_layout_of_dynerf(tmp_path):
 BOTH = [(synthesize_multicam, {"cameras": 2, "size": 16}), (synthesize_iphone, {"size": 12})]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("write", "arguments"), BOTH)
 def test_images_do_not_depend_on_the_number_of_processes(tmp_path, monkeypatch, write, arguments):
     """Threads take the processes' place, which start slowly."""
@@ -178,6 +181,7 @@ def in_metres(phone, camera):
     return replace(camera, camera_to_world=pose), world["scale"]
 
 
+@pytest.mark.slow
 def test_a_film_by_a_phone_reads_as_the_layout_says(phone, capture):
     assert (len(capture.train), len(capture.test)) == (FILMED, 6)
     assert [frame.camera_id for frame in capture.test] == [1, 1, 1, 2, 2, 2]
@@ -195,6 +199,7 @@ def test_a_film_by_a_phone_reads_as_the_layout_says(phone, capture):
     assert 0.02 < float((paths[:, 0] - paths[:, 1]).norm(dim=-1).max()) < 0.2
 
 
+@pytest.mark.slow
 def test_its_depth_is_true_within_the_error_but_for_the_holes(phone, capture):
     errors = []
     for frame in capture.train:
@@ -220,6 +225,7 @@ def test_a_lidar_has_holes_at_edges_and_beyond_its_reach():
     assert 0.9 < (depth[10:] > 0).mean() < 1
 
 
+@pytest.mark.slow
 def test_covisible_pixels_are_those_that_enough_images_show(phone, capture):
     """By the images' true depth maps, another way than rays to the points."""
     world = hall((FILMED - 1) / FPS)

@@ -77,6 +77,7 @@ def test_a_folder_that_cannot_be_written_to_is_refused(tmp_path):
         write_whole(tmp_path / "file" / "scene", "dnerf", {**TINY["dnerf"], "samples_per_pixel": 1})
 
 
+@pytest.mark.slow
 def test_what_is_written_reads_back(tmp_path):
     seen, few = [], {"size": 16, "frames": 4, "test_views": (3, 2, 2), "val_views": 2, "samples_per_pixel": 1}
     scenes.synthesize(tmp_path / "toy", **few, progress=lambda *n: seen.append(n))
@@ -99,6 +100,7 @@ def test_what_is_written_reads_back(tmp_path):
         assert frame.camera.camera_to_world[2, 1] < 0  # the image's down points to the ground
 
 
+@pytest.mark.slow
 def test_the_default_counts_of_lego_complete_are_the_published_ones(monkeypatch, tmp_path):
     written = {}
     monkeypatch.setattr(scenes, "write_worlds", lambda worlds, *_: written.update(worlds))
@@ -179,6 +181,7 @@ def in_vehicle_units(points):
     return (unscaled - np.array(scenes.WORLD_AT)) / scenes.WORLD_SCALE
 
 
+@pytest.mark.slow
 def test_the_phones_take_turns(rig):
     root, scene = rig
     for split, sides in ((scene.train, "lrl"), (scene.test, "rlr")):
@@ -191,6 +194,7 @@ def test_the_phones_take_turns(rig):
     assert hypernerf.read_scene(root, "scene", scale=2).train[0].load().shape == (SIDE * 3 // 8, SIDE // 2, 4)
 
 
+@pytest.mark.slow
 def test_all_that_is_seen_lies_between_near_and_far(rig):
     world, pairs = World("lift_tilt", has_room=True), rig_cameras(SIDE, np.linspace(0, 1, 3), 0)
     unit = scenes.WORLD_SCALE * scenes.SCENE_SCALE
@@ -202,6 +206,7 @@ def test_all_that_is_seen_lies_between_near_and_far(rig):
             assert distance.max() < frame.camera.far < 1.2 * distance.max() + 0.5
 
 
+@pytest.mark.slow
 def test_true_points_have_the_colour_of_their_pixels(rig):
     scene, times, world = rig[1], np.linspace(0, 1, 3), World("lift_tilt", has_room=True)
     assert scene.truth.times.tolist() == [0.5, 0, 1]

@@ -89,6 +89,7 @@ def test_blocks_are_where_they_are_and_nowhere_else(time):
     assert bool(posed.is_free(beside, along)[0]) is not there["north"]
 
 
+@pytest.mark.slow
 def test_the_corner_fills_every_image():
     room = SPECIMENS["room"]
     for camera in cameras(6, 24, room.azimuth, room.rise):

@@ -53,6 +53,7 @@ def watched(tmp_path_factory):
     return watched_run(folder, *all_watchers(), record).fit(), folder, record.losses
 
 
+@pytest.mark.slow
 def test_lines_where_there_is_no_terminal(tmp_path, capsys):
     progress = StageProgress(every=0)
     progress.later = 7200.0
@@ -72,6 +73,7 @@ def test_lines_where_there_is_no_terminal(tmp_path, capsys):
     assert [bool(match[3]) for match in shown] == [False] + [True] * STEPS  # none is timed by the first step
 
 
+@pytest.mark.slow
 def test_every_named_curve_is_there_and_a_mean_over_the_steps_between(watched):
     module, folder, losses = watched
     events = events_of(folder)
@@ -96,6 +98,7 @@ def test_every_named_curve_is_there_and_a_mean_over_the_steps_between(watched):
         assert [image.step for image in events.Images(f"images/{name}")] == [3, 6, 12]
 
 
+@pytest.mark.slow
 def test_gradients_are_measured_where_steps_are_logged_before_they_are_clipped(tmp_path, monkeypatch):
     measured, first = [], torch.nn.Parameter(torch.zeros(2))
     first.grad = torch.tensor([3.0, 4.0])
@@ -121,6 +124,7 @@ def test_gradients_are_measured_where_steps_are_logged_before_they_are_clipped(t
     assert len(measured) == STEPS // 5
 
 
+@pytest.mark.slow
 def test_without_validation_views_there_is_no_validation_curve(tmp_path):
     scene = replace(ball_scene(), val=())
     ours = watched_run(tmp_path, TrainingImages(moments=(1.0,)), steps=2)
@@ -146,6 +150,7 @@ def test_an_interrupted_watched_run_ends_as_an_unwatched_one(tmp_path, tmp_path_
     assert "025_compare.png" not in after  # that moment was past
 
 
+@pytest.mark.slow
 def test_the_clock_stands_still_while_something_is_shown(tmp_path, monkeypatch):
     clock, running = Clock(), []
 

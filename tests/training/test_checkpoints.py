@@ -94,6 +94,7 @@ def test_a_checkpoint_cannot_execute_code(tmp_path):
     assert not (tmp_path / "deed").exists()
 
 
+@pytest.mark.slow
 def test_checkpoints_come_by_the_clock(tmp_path, monkeypatch):
     saved = []
     save = lambda self, trainer: saved.append(trainer.global_step)  # noqa: E731
@@ -170,6 +171,7 @@ def test_a_full_disk_is_told_and_leaves_what_was_there(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["a.pt"]
 
 
+@pytest.mark.slow
 def test_a_packed_archive_is_not_unpacked(tmp_path):
     """Zeros of 16 MB in a file of 16 KB."""
     torch.save({"a": torch.zeros(1 << 22)}, tmp_path / "plain.pt")

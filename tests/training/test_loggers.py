@@ -79,6 +79,7 @@ def plain():
     return {"tensorboard": tensorboard, "csv": partial(CsvLogger, name="csv", version="")}
 
 
+@pytest.mark.slow
 def test_stages_are_one_curve_and_a_continued_run_goes_on_in_it(tmp_path, plain):
     interrupted_and_continued(tmp_path, plain)
     rows = read_rows(tmp_path / "run" / "csv" / "metrics.csv")
@@ -100,6 +101,7 @@ def test_stages_are_one_curve_and_a_continued_run_goes_on_in_it(tmp_path, plain)
     assert b"stage.fine.density" in table
 
 
+@pytest.mark.slow
 def test_what_others_log_is_on_the_axis_of_the_run(tmp_path, plain):
     loggers = RunLoggers({"csv": plain["csv"]}, tmp_path)
     run = make_run(tmp_path, [stage("coarse", iterations=50), stage("fine", iterations=50)], loggers=loggers)
@@ -111,6 +113,7 @@ def test_what_others_log_is_on_the_axis_of_the_run(tmp_path, plain):
     assert [row["step"] for row in rows if row["end"]] == ["50", "100"]
 
 
+@pytest.mark.slow
 def test_a_run_outlives_a_tracker_that_fails(tmp_path, plain, capsys):
     def broken(self, metrics, step):
         raise ConnectionError("no route\nto host")

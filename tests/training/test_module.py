@@ -169,6 +169,7 @@ def fitted(folder, own, limit=0.0, steps=5, **changes):
     return run.fit()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("limit", [0.0, 1e-3])
 def test_gradients_of_a_method_reach_the_optimiser_as_those_of_autograd_do(tmp_path, limit):
     ours, theirs = (fitted(tmp_path / str(own), own, limit) for own in (True, False))

@@ -172,6 +172,7 @@ def test_the_ends_of_time_get_their_share_once_all_frames_are_in():
     assert Curriculum([0.3], 0.3, all_in=0.0, ends_share=1.0)() == 0
 
 
+@pytest.mark.slow
 def test_frames_with_large_errors_come_more_often_and_those_without_count_as_the_worst():
     curriculum = Curriculum(TIMES, 0.0, all_in=0.0, error_share=1.0)
     assert len(draws(curriculum, 0.0, 500)) == 10

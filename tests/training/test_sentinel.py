@@ -66,6 +66,7 @@ def stopped(tmp_path_factory):
     return folder, broken(folder, Poison("batch", 5))
 
 
+@pytest.mark.slow
 def test_a_loss_that_is_not_finite_stops_the_stage_and_its_step_is_stored(stopped):
     folder, message = stopped
     path, found = folder / "coarse" / "broken" / "step_5.pt", "loss: batch[0].rgb (terms photo)"
@@ -81,11 +82,13 @@ def test_a_loss_that_is_not_finite_stops_the_stage_and_its_step_is_stored(stoppe
     assert stored["state_dict"]["method.radiance.color"].isfinite().all()
 
 
+@pytest.mark.slow
 def test_a_run_that_stopped_goes_on_from_its_last_checkpoint(stopped, tmp_path):
     shutil.copytree(stopped[0], tmp_path, dirs_exist_ok=True)
     assert same(run(tmp_path, Poison("nothing")).fit(), run(tmp_path / "whole", Poison("nothing")).fit())
 
 
+@pytest.mark.slow
 def test_steps_are_skipped_where_asked_counted_and_change_no_weight(tmp_path):
     assert "at step 5" in broken(tmp_path, Poison("batch", 3, 5), skip=1)
     poison = Poison("batch", 5)
@@ -99,6 +102,7 @@ def test_steps_are_skipped_where_asked_counted_and_change_no_weight(tmp_path):
     assert all(map(torch.equal, poison.weights[6], (kept[name] for name, _ in module.named_parameters())))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("what", "model", "found"),
     [
@@ -119,6 +123,7 @@ def test_what_is_not_finite_is_named_and_never_saved(tmp_path, what, model, foun
     assert all(v.isfinite().all() for v in tensors if torch.is_tensor(v))
 
 
+@pytest.mark.slow
 def test_a_step_that_cannot_be_stored_hides_nothing(tmp_path):
     (tmp_path / "coarse").mkdir()
     (tmp_path / "coarse" / "broken").write_text("")

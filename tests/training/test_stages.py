@@ -56,6 +56,7 @@ class Crash(lightning.Callback):
             raise SystemExit
 
 
+@pytest.mark.slow
 def test_a_continued_run_equals_an_uninterrupted_one_to_the_bit(tmp_path, whole):
     """Ended at a last step, between stages, and before, while and after the lattice grows."""
     fine = [tiny.Interrupt("fine", step) for step in (3, 5, 7)]
@@ -65,6 +66,7 @@ def test_a_continued_run_equals_an_uninterrupted_one_to_the_bit(tmp_path, whole)
     assert tiny.same(run(tmp_path).fit(), whole[1])
 
 
+@pytest.mark.slow
 def test_a_run_with_learned_nodes_and_rays_near_matter_continues_to_the_bit(tmp_path):
     nodes = tiny.forward_model(trajectory=partial(TrajectoryField, bases=4, nodes=16, kind="nodes"))
     for carry in ("all", "motion"):
@@ -82,6 +84,7 @@ def test_a_run_with_learned_nodes_and_rays_near_matter_continues_to_the_bit(tmp_
         assert tiny.same(run(tmp_path / f"{carry} in parts", **options).fit(), straight)
 
 
+@pytest.mark.slow
 def test_a_finished_run_is_loaded_and_one_that_was_not_noted_only_noted(tmp_path, whole):
     shutil.copytree(whole[0], tmp_path, dirs_exist_ok=True)
     before = {p: p.stat().st_mtime_ns for p in tmp_path.rglob("*") if p.is_file()}
@@ -148,6 +151,7 @@ class Diary(lightning.Callback):
         self.steps.append((module.settings.name, rates["flow"], bases, lattice, module.curriculum.in_play))
 
 
+@pytest.mark.slow
 def test_rates_bases_lattice_and_frames_follow_the_fraction(tmp_path):
     diary = Diary()
     run(tmp_path, [diary], lr_hold=0.5, curriculum={"start": 2, "all_in": 0.5}).fit()
@@ -161,6 +165,7 @@ def test_rates_bases_lattice_and_frames_follow_the_fraction(tmp_path):
     assert playing == (2, 4, 6, 8, 10, 12, 12, 12, 12, 12)
 
 
+@pytest.mark.slow
 def test_times_come_in_by_steps_and_what_a_short_stage_leaves_out_is_told(tmp_path):
     told, diary = [], Diary()
     ours = run(tmp_path, [diary], iterations=10, curriculum={"start": 2, "iterations_per_time": 3})
@@ -203,6 +208,7 @@ def test_elsewhere_the_peak_is_that_of_the_process(monkeypatch, tmp_path):
     assert stages_module.peak_memory_bytes() == peak
 
 
+@pytest.mark.slow
 def test_every_stage_counts_its_own_memory(tmp_path, monkeypatch):
     order = []
     monkeypatch.setattr(stages_module, "reset_peak_memory", lambda: order.append("reset"))
@@ -264,6 +270,7 @@ ENDED = "fine: ended after 10 steps, 0.833333 for each of 12 training pictures; 
 ENDED += "has: stage.fine.steps_per_picture=null"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "step", "number"), [("coarse", 5, signal.SIGINT), ("fine", 9, signal.SIGTERM)]
 )
@@ -285,6 +292,7 @@ def test_a_second_request_to_end_stops_at_once(tmp_path, number):
     assert not (tmp_path / "coarse" / "last.ckpt").exists()
 
 
+@pytest.mark.slow
 def test_a_folder_that_is_deleted_while_a_run_works_in_it_is_said(tmp_path):
     class Deleted(lightning.Callback):
         def on_train_end(self, trainer, module):
@@ -296,6 +304,7 @@ def test_a_folder_that_is_deleted_while_a_run_works_in_it_is_said(tmp_path):
     assert list((tmp_path / "coarse").iterdir()) == []
 
 
+@pytest.mark.slow
 def test_ctrl_c_that_no_step_follows_stops_before_the_next_stage(tmp_path, whole):
     class AtTheEnd(lightning.Callback):
         def on_train_end(self, trainer, module):

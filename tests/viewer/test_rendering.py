@@ -122,6 +122,7 @@ def test_a_time_is_warped_to_once_and_what_has_changed_is_forgotten(viewer, stat
     assert asked == [0.3, 0.6, 0.3]
 
 
+@pytest.mark.slow
 def test_a_layer_shows_its_particles_alone_and_voxels_have_none(viewer, state):
     data = small_data()
     module = shaken(module_with(data, **EVERY))

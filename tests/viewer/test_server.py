@@ -242,6 +242,7 @@ def without_a_server(monkeypatch, make_pages):
     monkeypatch.setattr(server_module, "serve", serve)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["forward", pytest.param("particles", marks=pytest.mark.slow)])
 def test_a_run_that_is_watched_ends_with_the_same_numbers(tmp_path, monkeypatch, capsys, method):
     plain = make_run(tmp_path / "plain", stages_of(method)).fit()
@@ -263,6 +264,7 @@ def test_a_run_that_is_watched_ends_with_the_same_numbers(tmp_path, monkeypatch,
     assert "gone while it was adapted" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_nobody_watching_costs_no_image(tmp_path, monkeypatch):
     run = make_run(tmp_path / "run", [stage()])
     without_a_server(monkeypatch, lambda viewer: ())

@@ -261,6 +261,7 @@ def test_a_path_goes_through_its_keys_smoothly(times):
         assert sorted(within, reverse=then < first) == within
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("seconds", "images"), [(1e9, 15_000), (-1.0, 2), (float("nan"), 2)])
 def test_a_video_is_as_long_as_it_may_be_and_has_two_keys(tmp_path, seconds, images):
     session, progress = Session(FakeViewer(), FakePage()), []

@@ -192,6 +192,7 @@ def test_distances_are_where_images_are_alike_or_go_there(nodes):
     torch.testing.assert_close(reached(lambda now: math.nan), torch.ones(2))
 
 
+@pytest.mark.slow
 def test_a_body_is_looked_for_where_it_is_seen_again(nodes):
     """Where it would go on is too far away for steps; where it is seen again counts if that is better."""
     truth = rolled(nodes, 0.5)

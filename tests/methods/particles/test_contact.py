@@ -267,6 +267,7 @@ def test_bodies_grow_until_they_touch_the_ground_and_images_stay_alike(led):
     torch.testing.assert_close((bodies.rest - eye).norm(dim=-1), 1.2 * far)
 
 
+@pytest.mark.slow
 def test_bodies_lead_until_their_share_of_the_stage_is_over(led):
     """A step at an image follows them there, and is of their poses alone; nothing rests before it is over."""
     fine, scene = led

@@ -213,6 +213,7 @@ def test_what_is_beyond_the_box_rests_without_a_node_and_may_be_large():
     assert int(method.skinning.shares[method.resting].count_nonzero()) == 0
 
 
+@pytest.mark.slow
 def test_what_masks_say_rests_in_a_film_follows_no_node():
     """However little of an image rests. Where no mask says what moves, masks of rest count."""
     height, width = DATA.scene.train[0].camera.height, DATA.scene.train[0].camera.width

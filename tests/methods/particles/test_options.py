@@ -13,6 +13,7 @@ from tests.support.configs import composed
 NAMES = [effect.name for effect in EFFECTS]
 
 
+@pytest.mark.slow
 def test_defaults_are_those_of_the_command():
     """Whoever builds particles in a notebook fits the method that ``forewarp-train`` fits."""
     config = OmegaConf.to_container(composed("model=particles", "preset=fast"), resolve=True)

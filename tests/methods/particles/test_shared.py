@@ -71,6 +71,7 @@ def test_training_changes_nothing_of_what_is_shared(still, window):
     assert torch.equal(method.ellipsoids(1.0).centers[kept], method.means[kept])
 
 
+@pytest.mark.slow
 def test_the_next_stage_and_a_checkpoint_know_what_is_shared(window):
     method = window.method
     after = begun(method)

@@ -48,6 +48,7 @@ def test_the_hull_is_around_the_ball(scene_of):
     assert cloud.size > 0
 
 
+@pytest.mark.slow
 def test_a_sweep_looks_at_neighbours_in_time_and_keeps_known_points(scene_of):
     scene = scene_of("hypernerf")
     cloud = start.swept(scene, [], 400)
@@ -150,6 +151,7 @@ def test_particles_begin_at_measured_depths_and_at_what_was_hidden_behind(scene_
     assert start.measured(scene_of("hypernerf"), 300) is None
 
 
+@pytest.mark.slow
 def test_what_a_stage_left_comes_first_and_random_points_last(scene_of):
     scene = scene_of("dnerf")
     left = Cloud(torch.rand(100, 3), torch.rand(100, 3), torch.ones(100), 0.1)
