@@ -52,7 +52,7 @@ WORKERS ?= logical
 PYTEST = pytest --no-cov -n $(WORKERS) --maxprocesses 4 --dist loadfile
 test: ## run the tests except the slow ones, on every core up to four [WORKERS=0: in one process]
 	$(BIN)/$(PYTEST) -m "not slow"
-test-slow: ## run the slow tests: the page in a browser, killed runs, every method on every dataset, every sweep's jobs, the wheel
+test-slow: ## run the slow tests: the page in a browser, killed runs, every method, every sweep's jobs, the wheel
 	$(BIN)/$(PYTEST) -m slow
 test-stability: ## run the numerical hard cases and killed runs, slow ones too
 	$(BIN)/pytest --no-cov -m stability tests/stability

@@ -142,21 +142,11 @@ AT_REST = "scene=counterpart_dnerf preset=compact"
 
 
 @pytest.mark.slow
-def test_the_small_form_writes_the_page_by_make(tmp_path):
-    words = ["make", "-f", str(ROOT / "Makefile"), f"BIN={ROOT}/.venv/bin", "accuracy-time", "SMALL=1"]
-    words += ["CHANGES=stage.fine.density=45", f"MORE={TINY}"]
-    done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True)
-    assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-2000:]
-    assert (tmp_path / "runs" / "small" / "accuracy_time" / "results" / "accuracy-time.md").is_file()
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("line", "page"),
     [
         ("gpu DEVICE=cpu", "bench-gpu/results/price-list.md"),
         (f"effects SEEDS=1 MORE='scene=specimen_still {TINY}'", "effects/results/effects-particles.md"),
-        (f"ablations SEEDS=1 MORE='ablation=full,no_tv {TINY}'", "results/ablation.md"),
         (f"ablations PRESET=compact SEEDS=1 MORE='{AT_REST} {TINY}'", "results/ablation.md"),
         (f"tables SEEDS=1 METHODS=nerf MORE='{TINY}'", "paper/results/paper.md"),
     ],

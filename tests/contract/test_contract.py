@@ -33,11 +33,10 @@ EFFECTS = [(name, effect) for name in METHODS for effect in METHODS[name].effect
 each_effect = pytest.mark.parametrize(("name", "effect"), EFFECTS)
 
 
-def on(datasets, first="dnerf"):
-    """Every method on every dataset; all but the first dataset are slow."""
-    pairs = [(n, d, cost(n) if d == first else pytest.mark.slow) for n in METHODS for d in datasets]
-    params = [pytest.param(n, d, marks=marks, id=f"{n}-{d}") for n, d, marks in pairs]
-    return pytest.mark.parametrize(("name", "dataset"), params)
+def on(datasets):
+    """Every method on every dataset."""
+    pairs = [(name, dataset) for name in METHODS for dataset in datasets]
+    return pytest.mark.parametrize(("name", "dataset"), pairs)
 
 
 def assert_equal_states(one, other):
@@ -105,6 +104,7 @@ def test_any_time_can_be_rendered(name, dataset, fitted):
             assert drawn.opacity.amax() > 0.05  # something is there
 
 
+@pytest.mark.slow
 @on(DATASETS)
 def test_pixels_and_crops_are_parts_of_the_whole_picture(name, dataset, fitted):
     found = fitted(name, dataset)

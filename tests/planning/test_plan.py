@@ -174,13 +174,14 @@ def specimens(tmp_path_factory):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("model", ["particles", "forward"])
 @pytest.mark.parametrize(
-    ("scene", "wanted"),
+    ("model", "scene", "wanted"),
     [
-        ("daylight", {"motion", "color_over_time", "view_dependence"}),
-        ("still", set()),
-        ("glossy", {"view_dependence"}),
+        ("particles", "daylight", {"motion", "color_over_time", "view_dependence"}),
+        ("particles", "still", set()),
+        ("particles", "glossy", {"view_dependence"}),
+        ("forward", "daylight", {"motion"}),
+        ("forward", "still", set()),
     ],
 )
 def test_specimens_get_what_they_call_for(ok, specimens, in_tmp, model, scene, wanted):
