@@ -72,6 +72,7 @@ def test_constructors_have_the_defaults_of_the_faithful_preset(method):
     assert {name for name, *_ in found} == ELSEWHERE.get(method, set()), found
 
 
+@pytest.mark.slow
 def test_a_stage_of_ndvg_has_the_defaults_of_its_last_one():
     stage = composed("data.scene=x", "model=ndvg", "preset=faithful").stage[STAGE]
     assert asdict(NDVGStage()) == {name: stage[name] for name in asdict(NDVGStage())}

@@ -34,6 +34,7 @@ def test_images_from_elsewhere_are_a_row_of_every_report(fitted, ok, refused, in
     assert "expected an empty folder, or images of other" in other
 
 
+@pytest.mark.slow
 def test_a_folder_of_other_files_is_not_written_into(fitted, refused):
     scene = "data=dnerf", f"data.root={fitted.parent / 'scenes'}", "data.scene=vehicle"
     words = f"renders={fitted / 'images'}", "name=a", *scene, f"run={fitted.parent / 'scenes' / 'vehicle'}"

@@ -101,6 +101,7 @@ def test_each_time_is_drawn_by_its_window(film, written, quality, least):
     assert float((ends[0] - ends[1]).abs().max()) > 0.05
 
 
+@pytest.mark.slow
 def test_what_all_windows_share_is_stored_once(film, written):
     file, facts = written()
     gaussians = read(file).gaussians

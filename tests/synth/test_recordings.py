@@ -76,6 +76,7 @@ def test_films_hold_the_true_frames_at_the_true_rates(made, truth, scene):
     assert {frame.name[7:12] for frame in scene.test} == {"cam01"}
 
 
+@pytest.mark.slow
 def test_a_frame_of_which_only_what_moves_is_rendered_is_the_whole_image(truth, scene):
     frame, world = scene.train[-1], hall(truth["seconds"])
     whole, _ = render(world, frame.time, frame.camera, 2, SHADOW_RAYS)
@@ -249,6 +250,7 @@ def test_covisible_pixels_are_those_that_enough_images_show(phone, capture):
         assert moving_faces(world)[hits.face[covisible]].any()
 
 
+@pytest.mark.slow
 def test_keypoints_follow_the_movers(phone, capture):
     marked = [frame for frame in capture.train if frame.keypoints is not None]
     moments = np.linspace(0, FILMED, 10, endpoint=False).astype(int)

@@ -223,6 +223,7 @@ def test_true_points_have_the_colour_of_their_pixels(rig):
         assert (errors < 0.15).mean() > 0.8
 
 
+@pytest.mark.slow
 def test_still_points_lie_on_what_never_moves(rig):
     still = in_vehicle_units(rig[1].still)
     assert len(still) > 1000

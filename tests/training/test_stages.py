@@ -98,6 +98,7 @@ def test_a_finished_run_is_loaded_and_one_that_was_not_noted_only_noted(tmp_path
     assert run(tmp_path).finished()["fine"]["steps"] == 10
 
 
+@pytest.mark.slow
 def test_what_a_run_leaves(whole):
     folder, module = whole
     assert {p.name for p in (folder / "fine").iterdir()} >= {"last.ckpt", "handover.json", "done.json"}
