@@ -214,6 +214,12 @@ BAD = [
     (set_to(2, 14, 0), r"row 2 \(cam02\): focal length: expected a number in \[0.48, 4800\], but got 0"),
     (set_to(2, 9, 48.5), r"row 2 \(cam02\): height and width: expected whole numbers, but got 32 and 48.5"),
     (set_to(2, 16, 3), r"row 2 \(cam02\): bounds: expected 0 < near < far, but got 14 and 3"),
+    (set_to(2, 16, 3e4), r"row 2 \(cam02\): expected far within 10 times .*, 30, but got .* set data.far"),
+    (set_to(2, 15, 0.014), r"row 2 \(cam02\): expected near within 10 times .*, 14, but got 0.014, as of"),
+    (
+        rows(lambda a: a[[0, 1, 1]]),
+        "npy: expected a pose for each camera, but got one for cam01/0000 and cam02/0000, whose",
+    ),
     (set_to(2, 9, 50), "cam02: expected 50 x 32 or 25 x 16 pixels as .* say, but got 48 x 32"),
     (lambda folder: [shutil.rmtree(place) for place in folder.glob("cam*")], "a video for each camera"),
     (

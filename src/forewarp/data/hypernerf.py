@@ -74,6 +74,7 @@ from forewarp.data.images import (
     write_image,
 )
 from forewarp.data.names import in_order, read_names
+from forewarp.data.rigs import refuse_copied_poses
 from forewarp.data.transforms import (
     LIKE_LENS,
     beside_images,
@@ -251,6 +252,7 @@ def read_scene(
             next(iter(dark.values()))()  # refuses it
         line = f"alpha is 0 everywhere in {len(dark)} images, which are left out ({min(dark)}, ..)"
         assumed.append(f"{images}: {line}; if alpha is of other use, set data.masks=off")
+    refuse_copied_poses((*train, *test), folder / "camera")
     advice = {"unit": "multiply it by {}", "far_key": "mend far in scene.json"}
     assumed += doubt_depths(train, size, depth_kind, folder / (depth or ""), **advice)
     assumed += _doubt_evidence(folder, scale, train, test)

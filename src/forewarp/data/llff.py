@@ -2,26 +2,29 @@
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 
 from forewarp.data.agreement import small_image
 from forewarp.data.cameras import opengl_rows
 from forewarp.data.files import SUFFIXES, images_alone, mismatch
 from forewarp.data.images import by, inspect_image, read_image
-from forewarp.data.multicam import FILE, ordered_rows
+from forewarp.data.multicam import FILE, ends_of, ordered_rows
 from forewarp.data.names import in_order
 
 _SAME_SHAPE = 0.02  # share by which the proportions of images and rows may differ
 
 
-def as_transforms(folder: Path) -> tuple[dict, list[str]]:
+def as_transforms(
+    folder: Path, near: float | None = None, far: float | None = None
+) -> tuple[dict, list[str]]:
     """Make of a scene's ``poses_bounds.npy`` and ``images/`` what a ``transforms.json`` would hold.
 
-    Images may be smaller than rows say. Also say in lines what was assumed.
+    Images may be smaller than rows say; ``near`` and ``far`` are as typed. Also say in lines what was
+    assumed.
 
     Raises:
-        SceneError: for other numbers of rows and images, for rows that are none, and images of another shape.
+        SceneError: for other numbers of rows and images, for rows that are none, images of another shape, and
+            as ``ends_of``.
     """
     there = (path for path in (folder / "images").glob("[!.]*") if path.suffix in SUFFIXES)
     paths, told = images_alone(in_order(there, lambda path: path.name), folder / "images")
@@ -40,6 +43,5 @@ def as_transforms(folder: Path) -> tuple[dict, list[str]]:
         pose = opengl_rows(camera.camera_to_world, str(path))
         focal = camera.fx * width / camera.width
         frames.append({"file_path": f"images/{path.name}", "transform_matrix": pose, "fl_x": focal})
-    aslant = max(math.hypot(1, math.hypot(c.width / c.fx, c.height / c.fy) / 2) for c in cameras)
-    ends = {"near": min(c.near for c in cameras), "far": aslant * max(c.far for c in cameras)}
-    return {"frames": frames, **ends}, told + assumed
+    near, far = ends_of(cameras, names, str(folder / FILE), near, far)
+    return {"frames": frames, "near": near, "far": far}, told + assumed

@@ -17,6 +17,7 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from statistics import median
 
 import numpy as np
 import torch
@@ -53,7 +54,7 @@ from forewarp.data.images import (
     read_image,
 )
 from forewarp.data.names import in_order, read_names
-from forewarp.data.rigs import held_cameras, held_moments, split_rig
+from forewarp.data.rigs import held_cameras, held_moments, refuse_copied_poses, split_rig
 from forewarp.data.video import VIDEOS, doubts_of, extracted, stamps_of
 from forewarp.files import written_whole
 from forewarp.scene.camera import Camera
@@ -62,6 +63,7 @@ from forewarp.scene.frame import Frame, Scene, middle_of, spread
 FILE = "poses_bounds.npy"
 _COMPARED = 24  # views, at most, by which an order is told
 _AGREES = 0.8  # error of the right order as a share of the other's, at most
+_BEYOND = 10.0  # times the median of near or far, by which a row's is off at most
 _EVEN = 0.1  # frames by which even times may be off
 _TAIL = 10  # the part of a film, a tenth, that is its end
 _MOST_APART, _DRIFT = 0.5, 0.1  # frames by which two videos may run apart, and do so without a word
@@ -179,10 +181,7 @@ def read_scene(
         else:
             size = (camera.width, camera.height)
             loads.append(Film(track.path, track.stamps[:count], size, bytes_of_all).images)
-    aslant = max(math.hypot(1, math.hypot(c.width / c.fx, c.height / c.fy) / 2) for c in cameras)
-    near, far = number_or_none(near, "data.near"), number_or_none(far, "data.far")
-    near = min(camera.near for camera in cameras) if near is None else near
-    far = aslant * max(camera.far for camera in cameras) if far is None else far
+    near, far = ends_of(cameras, list(paths), str(folder / FILE), near, far)
     options = {"near": near, "far": far, "box": box_of(box), "normalise": normalise}
     space, seen = space_of(cameras, str(folder / FILE), **options)
     cameras = [space.camera(camera) for camera in cameras]
@@ -195,6 +194,7 @@ def read_scene(
 
     taken = ((moment, view(moment, k)) for moment in range(count) for k in range(len(cameras)))
     train, test = split_rig(taken, held, moments, every)
+    refuse_copied_poses((*train, *test), folder / FILE)
     sizes = sorted({(camera.width, camera.height) for camera in cameras}, reverse=True)
     stamps = next((track.stamps for track in tracks if track.stamps is not None), None)
     protocol = {
@@ -310,6 +310,29 @@ def read_rows(path: Path, names: Sequence[str]) -> list[Camera]:
         middle = width / 2, height / 2
         cameras.append(Camera(int(width), int(height), focal, focal, *middle, pose, near, far))
     return cameras
+
+
+def ends_of(
+    cameras: Sequence[Camera], names: Sequence[str], where: str, near: float | None, far: float | None
+) -> tuple[float, float]:
+    """Return near and far along unit rays that hold the depths of all rows; what is given stays.
+
+    Raises:
+        SceneError: naming a row whose near or far is far beyond that of the others.
+    """
+    near, far = number_or_none(near, "data.near"), number_or_none(far, "data.far")
+    for key, given, sign in (("near", near, -1), ("far", far, 1)):
+        ends = [getattr(camera, key) for camera in cameras]
+        beyond = [(end / median(ends)) ** sign for end in ends]
+        row = beyond.index(max(beyond))
+        if given is None and beyond[row] > _BEYOND:
+            got = f"{ends[row]:.4g}, as of a point in a wrong place"
+            advice = f"mend the row, or set data.{key}"
+            expected = f"{key} within {_BEYOND:g} times that of other rows, {median(ends):.4g}"
+            raise mismatch(f"{where}: row {row} ({names[row]})", expected, got, advice)
+    aslant = max(math.hypot(1, math.hypot(c.width / c.fx, c.height / c.fy) / 2) for c in cameras)
+    near = min(camera.near for camera in cameras) if near is None else near
+    return near, aslant * max(camera.far for camera in cameras) if far is None else far
 
 
 def _rolled(cameras: Sequence[Camera]) -> bool:

@@ -41,7 +41,7 @@ from forewarp.data.images import (
     mixed_linear,
     write_image,
 )
-from forewarp.data.rigs import held_cameras, held_moments, split_rig
+from forewarp.data.rigs import held_cameras, held_moments, refuse_copied_poses, split_rig
 from forewarp.files import decoded, replace_file
 from forewarp.scene.box import Box
 from forewarp.scene.camera import Camera
@@ -143,6 +143,7 @@ def read_scene(
     span = max(numbers[-1] - numbers[0], 1)
     taken = ((f, view(f, k)) for f in range(moments) for k in range(len(poses)))
     train, test = split_rig(taken, held, held_times, every)
+    refuse_copied_poses((*train, *test), folder / "CamPose.inf")
     if on_disk[0] != 0 or first != 0 or on_disk[-1] - on_disk[0] >= len(on_disk):
         said = f"frames {on_disk[0]} to {on_disk[-1]} ({len(on_disk)}) and cameras from {first}"
         assumed = [f"{folder / 'img'}: {said} taken in order, times by their numbers", *assumed]

@@ -66,7 +66,7 @@ from forewarp.data.images import (
     write_image,
 )
 from forewarp.data.names import in_order, read_names
-from forewarp.data.rigs import held_cameras, held_moments, split_rig
+from forewarp.data.rigs import held_cameras, held_moments, refuse_copied_poses, split_rig
 from forewarp.data.transforms import (
     ListedImage,
     check_times,
@@ -189,7 +189,7 @@ def read_scene(
             )
             key = "data.axes" if axes == "opencv" else "data.inverse"
             raise mismatch(key, expected, axes if axes == "opencv" else inverse, "leave it out")
-        file, (content, ordered) = folder / llff.FILE, llff.as_transforms(folder)
+        file, (content, ordered) = folder / llff.FILE, llff.as_transforms(folder, near, far)
     else:
         content = stated(read_json(file))
     entries, absent, assumed = _read_entries(file, content, scale, axes, inverse, masks)
@@ -276,6 +276,7 @@ def read_scene(
         return Frame(e.name, e.time, camera, e.load, **beside, camera_id=camera_id, moment=e.moment)
 
     train, val, test = (tuple(map(frame, parts[split])) for split in SPLITS)
+    refuse_copied_poses((*train, *val, *test), file)
     assumed += doubt_depths(train, space.scale, depth_kind, place or file, "set data.depth_scale={}")
     ranks = {time: n for n, time in enumerate(sorted({*times}))}
     moments = {e.name: ranks[e.time] if e.moment is None else e.moment for e in entries}

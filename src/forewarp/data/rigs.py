@@ -6,10 +6,12 @@ from collections.abc import Collection, Iterable, Sequence
 from dataclasses import replace
 from reprlib import repr as short
 
+from forewarp.data.agreement import small_image
 from forewarp.data.files import mismatch
 from forewarp.scene.frame import Frame
 
 _SHOWN = 6  # names of cameras in an error
+_DIFFER = 0.02  # difference of colours in [0, 1], from which on two images are not of one pose
 
 
 def held_cameras(wanted: Sequence[str | int] | None, names: list[str], default: Iterable[int]) -> list[int]:
@@ -83,3 +85,27 @@ def split_rig(
         advice = "name some in data.test_cameras or data.test_moments"
         raise mismatch("data.test_cameras", "a camera or a moment to test on", "none", advice)
     return tuple(train), tuple(test)
+
+
+def refuse_copied_poses(frames: Iterable[Frame], where: object) -> None:
+    """Refuse two cameras of just one pose whose images of one time differ.
+
+    Args:
+        frames: of a rig; others have no ``camera_id`` and are not looked at.
+        where: what poses belong to.
+
+    Raises:
+        SceneError: naming both.
+
+    Cost: two images are decoded where poses are one.
+    """
+    first: dict[tuple, Frame] = {}
+    for frame in (frame for frame in frames if frame.camera_id is not None):
+        pose = frame.camera.camera_to_world
+        other = first.setdefault((frame.time, frame.camera.inner, tuple(pose.flatten().tolist())), frame)
+        if frame.camera_id == other.camera_id:
+            continue
+        one, two = (small_image(each.load()) for each in (other, frame))
+        if float((one - two).abs().mean()) > _DIFFER:
+            got = f"one for {other.name} and {frame.name}, whose images differ"
+            raise mismatch(where, "a pose for each camera", got, "mend the one that was copied")
