@@ -2,6 +2,7 @@
 
 import re
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 import torch
 from PIL import Image
 
+from forewarp.data import images
 from forewarp.data.cameras import FLIP
 from forewarp.data.nhr import read_scene
 from tests.support.written_scenes import (
@@ -236,11 +238,12 @@ def test_intrinsics_of_images_of_another_size_are_named(toy, factor, said, half)
         read_scene(toy.parent, "toy", half_resolution=half)
 
 
-def test_reading_a_scene_decodes_no_image(written, monkeypatch):
-    def decode(*_):
-        raise AssertionError
+def test_reading_a_scene_decodes_masks_of_its_first_frame_alone(written, monkeypatch):
+    def decode(path, *mode, real=images._decode):
+        assert path.parent == written / "toy" / "img" / "0" / "mask"
+        return real(path, *mode)
 
-    monkeypatch.setattr("forewarp.data.images._decode", decode)
+    monkeypatch.setattr(images, "_decode", decode)
     scene = read_scene(written, "toy")
     with pytest.raises(AssertionError):
         scene.train[0].load()
@@ -306,3 +309,27 @@ def test_an_image_that_is_missing_in_the_first_frame_is_named(toy):
     (toy / "img" / "0" / "img_0000.jpg").unlink()
     with refused(r"0/img_0000\.jpg: expected"):
         read_scene(toy.parent, "toy")
+
+
+@pytest.mark.parametrize(
+    ("files", "also"),
+    [
+        (("CamPose.inf",), ""),
+        (("CamPose.inf", "Intrinsic.inf"), " and blocks of Intrinsic.inf"),
+    ],
+)
+def test_rows_in_another_order_than_images_are_told_by_clouds(tmp_path, files, also):
+    cameras = [replace(c, cx=c.cx + 6 * (k % 3)) for k, c in enumerate(dome(12, ((60, 48),)))]
+    write_dome(tmp_path / "toy", cameras, count=1)
+    read_scene(tmp_path, "toy")
+    order = sorted(range(12), key=str)
+    for name in files:
+        path, end = tmp_path / "toy" / name, "\n" if name == "CamPose.inf" else "\n\n"
+        rows = path.read_text().strip().split(end)
+        rows = [rows[k] for k in order]
+        if name == "Intrinsic.inf":
+            rows = [re.sub(r"^\d+", str(k), row) for k, row in enumerate(rows)]
+        path.write_text(end.join(rows) + end)
+    said = "if rows are in the order of cameras' numbers as texts, as 1, 10, 11, 2: row 4 is of img_0002.jpg"
+    with refused(f"CamPose.inf: expected a row for .*, and 100% {said}.*; sort rows{also} by that"):
+        read_scene(tmp_path, "toy")

@@ -11,11 +11,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
+from functools import lru_cache
+from itertools import chain, pairwise, product
 from pathlib import Path
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from forewarp.data.arrays import read_cloud, read_truth, shortened, write_array, write_truth
 from forewarp.data.cameras import box_of, check_camera, near_origin, pose_of
@@ -34,6 +36,7 @@ from forewarp.data.files import (
 from forewarp.data.images import (
     Header,
     StoredImage,
+    bright,
     by,
     check_pixels,
     exif_turned,
@@ -45,7 +48,7 @@ from forewarp.data.rigs import held_cameras, held_moments, refuse_copied_poses, 
 from forewarp.files import decoded, replace_file
 from forewarp.scene.box import Box
 from forewarp.scene.camera import Camera
-from forewarp.scene.frame import Frame, Scene, Truth
+from forewarp.scene.frame import Frame, Scene, Truth, spread
 
 _PADDING = 0.1  # of the points' extent, on every side
 _ORDER = [2, 0, 1, 3]  # of a pose's columns in a line: z axis, x axis, y axis, centre
@@ -54,6 +57,8 @@ _READINGS = {  # what else may be in a line
     "they are world-to-camera": inverted,
     "the axes are OpenGL's": opposite,
 }
+_COMPARED, _POINTS = 16, 500  # cameras and points by which the order of rows is doubted
+_MISSED = 0.05  # share of a cloud that falls beside masks, from which on it is; right rows have 0.02
 _MOST_PIXELS_OFF = 1e7  # beyond it a lens is wrong
 
 
@@ -79,7 +84,8 @@ def read_scene(
     test_moments: Sequence[int] | None = None,
     test_every: int = 1,
 ) -> Scene:
-    """Read ``root/scene``; of the images only headers are read, pixels are decoded when a frame is loaded.
+    """Read ``root/scene``; of images only headers are read, and of masks a few: pixels are decoded when a
+    frame is loaded.
 
     Args:
         half_resolution: average 2 x 2 pixels; an odd last row or column is cut off.
@@ -125,11 +131,13 @@ def read_scene(
     sizes, headers = _read_sizes(places[:moments], names, half_resolution)
     turned = [path for path, header in headers.items() if header.is_turned]
     images = {path: header for path, header in headers.items() if path.parent.name != "mask"}
-    bounds, assumed = _bounds(folder, numbers, on_disk) if box is None else (box_of(box), [])
+    bounds, assumed, points = _bounds(folder, numbers, on_disk) if box is None else (box_of(box), [], None)
     cameras = [_camera(*of, half_resolution, bounds) for of in zip(sizes, matrices, poses, strict=True)]
     for number, camera in enumerate(cameras):
         where = f"{folder / 'Intrinsic.inf'}: camera {number}"
         check_camera(camera, where, where)
+    if points is not None:
+        _refuse_order(folder / "CamPose.inf", cameras, [places[0] / "mask" / name for name in names], points)
     world = near_origin(bounds.center, max(camera.far for camera in cameras))
     cameras = [replace(c, camera_to_world=world.to_scene(c.camera_to_world)) for c in cameras]
     bounds = Box(*world.to_scene(np.array([bounds.low, bounds.high])).tolist())
@@ -286,9 +294,60 @@ def _read_sizes(
     return sizes, headers
 
 
-def _bounds(folder: Path, numbers: Sequence[int], on_disk: Sequence[int]) -> tuple[Box, list[str]]:
+def _refuse_order(path: Path, cameras: Sequence[Camera], masks: Sequence[Path], points: Tensor) -> None:
+    """Refuse poses in another order than images: then much more of the first frame's cloud falls on masks if
+    they are exchanged.
+
+    Args:
+        path: of the poses, for errors.
+        cameras: as read.
+        masks: of the first frame's images.
+        points: (N, 3) of its cloud.
+    """
+    size = [(camera.width, camera.height) for camera in cameras]
+    shown = lru_cache(None)(lambda k: bright(masks[k], size[k]))
+    some = spread(len(cameras), _COMPARED)
+    if sum(_missed(cameras[k], shown(k), points) for k in some) <= _MISSED * len(some):
+        return
+    from scipy.optimize import linear_sum_assignment  # late: it takes long, and hardly any scene needs it
+
+    every, found = range(len(cameras)), []
+    for inner in (
+        lambda k, row: k,
+        lambda k, row: row,
+    ):  # rows of poses alone are in another order, or blocks, too
+        missed = np.zeros((len(cameras), len(cameras)))
+        for k, row in product(every, every):
+            camera = replace(cameras[inner(k, row)], camera_to_world=cameras[row].camera_to_world)
+            missed[k, row] = _missed(camera, shown(k), points)
+        rows = linear_sum_assignment(missed)[1].tolist()
+        found.append((float(missed[every, rows].mean()), rows))
+    now, (then, rows) = float(missed.trace()) / len(cameras), min(found)
+    if then > now / 2 or now - then < _MISSED:
+        return
+    moved = [f"row {row} is of {masks[k].name}" for k, row in enumerate(rows) if row != k]
+    how = ", ".join(moved[:3]) + ", .." * (len(moved) > 3)
+    texts = sorted(every, key=str), sorted(every, key=lambda k: str(k + 1))
+    if sorted(every, key=rows.__getitem__) in texts:
+        how = f"rows are in the order of cameras' numbers as texts, as 1, 10, 11, 2: {how}"
+    got = f"clouds of which {1 - now:.0%} falls on the masks, and {1 - then:.0%} if {how}"
+    blocks = found[1][0] - found[0][0]  # how much worse it is with them
+    also = " and blocks of Intrinsic.inf" if blocks < -_MISSED / 2 else ""
+    also = also or ", and blocks of Intrinsic.inf if they are so, too," * (blocks < _MISSED / 2)
+    raise mismatch(path, "a row for each image in the order of their names", got, f"sort rows{also} by that")
+
+
+def _missed(camera: Camera, mask: Tensor, points: Tensor) -> float:
+    """Return which share of points (N, 3) a camera does not see on a mask (H, W)."""
+    pixel, z = camera.project(points)
+    column, row = pixel.floor().long().unbind(-1)
+    inside = (z > 0) & (column >= 0) & (row >= 0) & (column < mask.shape[1]) & (row < mask.shape[0])
+    return 1 - float(mask[row[inside], column[inside]].sum()) / len(points)
+
+
+def _bounds(folder: Path, numbers: Sequence[int], on_disk: Sequence[int]) -> tuple[Box, list[str], Tensor]:
     """Put a box around the points of the frames of these numbers, the first of those on disk, with some
-    padding.
+    padding; also return lines of what was assumed, and some points (N, 3) of the first.
 
     A cloud's number is its frame's and 1; those of an excerpt may be in its order, and others count from 0 as
     the frames do, which the lines that come with the box say.
@@ -311,12 +370,14 @@ def _bounds(folder: Path, numbers: Sequence[int], on_disk: Sequence[int]) -> tup
     if lacking := [number for number in counted if number not in clouds]:
         advice = "add it, or set data.box=[x0,y0,z0,x1,y1,z1]"
         raise mismatch(place / f"frame{lacking[0]}.npy", "a point cloud of each frame", "none", advice)
-    points_of = (read_cloud(clouds[number], 6)[:, :3] for number in counted)
+    first = read_cloud(clouds[counted[0]], 6)[:, :3]
+    points_of = chain([first], (read_cloud(clouds[number], 6)[:, :3] for number in counted[1:]))
+    first = torch.from_numpy(first[:: -(-len(first) // _POINTS)].copy())
     corners = np.array([(points.min(0), points.max(0)) for points in points_of], np.float64)
     low, high = corners.min((0, 1)), corners.max((0, 1))
     margin = _PADDING * (high - low)
     try:
-        return Box((low - margin).tolist(), (high + margin).tolist()), assumed
+        return Box((low - margin).tolist(), (high + margin).tolist()), assumed, first
     except ValueError as error:
         got = f"{low.tolist()} to {high.tolist()}"
         raise mismatch(place, "points that span a box", got, "set data.box") from error
