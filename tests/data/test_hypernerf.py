@@ -124,7 +124,15 @@ def test_names_tell_the_moment_where_warp_id_counts_one_camera_after_the_other(t
     scene = counted(sorted)
     assert {f.name: f.time for f in (*scene.train, *scene.test)} == pytest.approx(expected)
     (line,) = scene.protocol["assumed"]
-    assert "warp_id counts the items of one camera after the other: times are the numbers in their" in line
+    assert "warp_id counts the items in another order than the numbers in their names: times are" in line
+    edit(file, lambda c: [entry.update(camera_id=0) for entry in c.values()])  # names tell cameras, too
+    scene = read_scene(tmp_path, "toy")
+    assert {f.name: f.time for f in (*scene.train, *scene.test)} == pytest.approx(expected)
+    assert {f.camera_id for f in (*scene.train, *scene.test)} == {0, 1}
+    edit(file, lambda c: [entry.update(time_id=entry["warp_id"]) for entry in c.values()])
+    (line,) = read_scene(tmp_path, "toy").protocol["assumed"]  # and what time_id says stays
+    assert "time_id counts the items in another order than the numbers in their names; if" in line
+    write_rig(tmp_path / "toy", rig())
     # In the order of the moments it may be right, as of cameras that take turns.
     assert "assumed" not in counted(lambda items: sorted(items, key=lambda i: i.split("_")[1])).protocol
 

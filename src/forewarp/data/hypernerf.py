@@ -557,7 +557,8 @@ def _read_items(path: Path, ids: list[str]) -> tuple[dict[str, int], dict[str, i
     say in lines what was assumed.
 
     A moment is ``time_id``, or where none of ``ids`` has one ``warp_id``; where that only counts the items,
-    one camera after the other, the number in their names. Entries of other items are not looked at.
+    as one camera after the other, the number in their names, which then tell cameras, too. Entries of other
+    items are not looked at.
 
     Raises:
         SceneError: for an item that is missing or has no time, and for a number that is not whole.
@@ -581,20 +582,25 @@ def _read_items(path: Path, ids: list[str]) -> tuple[dict[str, int], dict[str, i
     read = None
     with suppress(SceneError):  # names that do not tell are no help
         read = read_names(ids, str(path))
-    named = dict(zip(ids, read.frames)) if read else {}
-    if key == "time_id" or not _counts_items(moments, named, cameras):
+    named, views = dict(zip(ids, read.frames)) if read else {}, cameras
+    if read and read.cameras and len({*cameras.values()}) == 1:  # a number that says nothing
+        order = in_order({*read.cameras})
+        views = {item: order.index(camera) for item, camera in zip(ids, read.cameras)}
+    if not _counts_items(moments, named, views):
         return moments, cameras, []
-    said = "counts the items of one camera after the other: times are the numbers in their names"
-    return named, cameras, [f"{path}: warp_id {said}; write time_id if they are wrong"]
+    line = f"{path}: {key} counts the items in another order than the numbers in their names"
+    if key == "time_id":
+        return moments, cameras, [f"{line}; if cameras film at once, give items of one moment one time_id"]
+    return named, views, [f"{line}: times are these numbers; write time_id if they are wrong"]
 
 
-def _counts_items(warps: dict[str, int], named: dict[str, float], cameras: dict[str, int | None]) -> bool:
-    """Tell whether ``warp_id`` says nothing of the moment: it differs everywhere, while names give items of
-    several cameras one number, and it does not grow with that.
+def _counts_items(moments: dict[str, int], named: dict[str, float], cameras: dict[str, int | None]) -> bool:
+    """Tell whether numbers of moments seem to say nothing of these: they differ everywhere, while names give
+    items of several cameras one number, and they do not grow with that.
     """
     pairs = {(number, cameras[item]) for item, number in named.items()}
-    are_distinct = len(pairs) == len(named) and len({*warps.values()}) == len(warps)
-    in_turn = [named[item] for item in sorted(named, key=warps.get)]
+    are_distinct = len(pairs) == len(named) and len({*moments.values()}) == len(moments)
+    in_turn = [named[item] for item in sorted(named, key=moments.get)]
     return are_distinct and None not in cameras.values() and in_turn != sorted(in_turn)
 
 
