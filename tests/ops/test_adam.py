@@ -2,6 +2,7 @@ import math
 
 import pytest
 import torch
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from forewarp.ops.adam import AdamState, adam_rows
 
@@ -64,6 +65,28 @@ def test_rows_of_any_width_and_number_of_steps_equal_the_reference(width):
     for part, twin, then in zip(fast, exact, before):
         torch.testing.assert_close(part.double(), twin, rtol=1e-5, atol=1e-6)
         assert torch.equal(part[rest], then[rest])
+
+
+class Called(TorchDispatchMode):
+    """The operators that PyTorch calls, by name."""
+
+    def __init__(self):
+        super().__init__()
+        self.names = []
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        self.names.append(func.overloadpacket.__name__)
+        return func(*args, **(kwargs or {}))
+
+
+def test_on_a_gpu_no_step_waits_for_numbers_of_it():
+    """Without a kernel no operator's shape or value depends on numbers: those would have to come to the host."""
+    parts, gradient = [part.double() for part in state((37, 3))], numbered((37, 3), 1).double()
+    gradient[3] = 0
+    with Called() as called:
+        step(parts, gradient)
+    assert len(called.names) > 10
+    assert not {"nonzero", "index", "index_put_", "masked_select", "_local_scalar_dense"} & set(called.names)
 
 
 def test_not_a_number_is_kept(backend):

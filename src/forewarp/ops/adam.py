@@ -84,12 +84,13 @@ def _adam_numba(states: list[AdamState], betas: tuple[float, float], eps: float)
 
 
 def _adam_reference(state: AdamState, betas: tuple[float, float], eps: float) -> None:
-    """``adam_rows`` of one parameter in plain PyTorch."""
+    """``adam_rows`` of one parameter in plain PyTorch, without an index of rows, for which a GPU's host would wait."""
     value, gradient, mean, square, steps, lr = state
     seen = (gradient != 0).any(-1)
-    n, g = steps[seen] + 1, gradient[seen]
-    m = betas[0] * mean[seen] + (1 - betas[0]) * g
-    v = betas[1] * square[seen] + (1 - betas[1]) * g * g
-    steps[seen], mean[seen], square[seen] = n, m, v
-    first, second = (1 - torch.pow(b, n)[..., None] for b in betas)
-    value[seen] -= lr * (m / first) / ((v / second).sqrt() + eps)
+    steps += seen
+    n, seen = steps[..., None], seen[..., None]
+    m, v = betas[0] * mean + (1 - betas[0]) * gradient, betas[1] * square + (1 - betas[1]) * gradient * gradient
+    first, second = (1 - torch.pow(b, n) for b in betas)  # 0 in rows that have not been seen yet
+    value -= torch.where(seen, lr * (m / first) / ((v / second).sqrt() + eps), 0)
+    mean.copy_(torch.where(seen, m, mean))
+    square.copy_(torch.where(seen, v, square))
