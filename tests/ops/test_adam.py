@@ -80,7 +80,7 @@ class Called(TorchDispatchMode):
 
 
 def test_on_a_gpu_no_step_waits_for_numbers_of_it():
-    """Without a kernel no operator's shape or value depends on numbers: those would have to come to the host."""
+    """Without a kernel no operator depends on numbers that would first have to come to the host."""
     parts, gradient = [part.double() for part in state((37, 3))], numbered((37, 3), 1).double()
     gradient[3] = 0
     with Called() as called:

@@ -84,12 +84,13 @@ def _adam_numba(states: list[AdamState], betas: tuple[float, float], eps: float)
 
 
 def _adam_reference(state: AdamState, betas: tuple[float, float], eps: float) -> None:
-    """``adam_rows`` of one parameter in plain PyTorch, without an index of rows, for which a GPU's host would wait."""
+    """``adam_rows`` of one parameter in plain PyTorch. Picking rows by index would let a GPU's host wait."""
     value, gradient, mean, square, steps, lr = state
     seen = (gradient != 0).any(-1)
     steps += seen
     n, seen = steps[..., None], seen[..., None]
-    m, v = betas[0] * mean + (1 - betas[0]) * gradient, betas[1] * square + (1 - betas[1]) * gradient * gradient
+    m = betas[0] * mean + (1 - betas[0]) * gradient
+    v = betas[1] * square + (1 - betas[1]) * gradient * gradient
     first, second = (1 - torch.pow(b, n) for b in betas)  # 0 in rows that have not been seen yet
     value -= torch.where(seen, lr * (m / first) / ((v / second).sqrt() + eps), 0)
     mean.copy_(torch.where(seen, m, mean))
