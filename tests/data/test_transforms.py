@@ -371,6 +371,31 @@ def test_a_split_that_counts_its_own_images_is_refused(test, is_refused):
         check_times(given, "t.json", cameras)
 
 
+@pytest.mark.parametrize("unit", [1, 1 / 40])
+def test_times_of_splits_numbered_together_that_count_themselves_are_refused(unit):
+    def given(train, test, of=None):
+        splits, length = {"train": train, "test": test}, {"train": 40, "test": of}
+        scaled = {k: 40 * unit / (length[k] or 40) for k in splits}
+        return {
+            k: {f"{k}/r_{n:03d}": scaled[k] * (n if of is None else i) for i, n in enumerate(ns)}
+            for k, ns in splits.items()
+        }
+
+    between, after = [n for n in range(40) if n % 8 != 4], range(40, 50)
+    with refused(
+        r"times of test frames: expected \S+ to \S+ by their numbers, .*; count all images together"
+    ):
+        check_times(given(between, range(4, 40, 8), 5), "t.json")
+    (line,) = check_times(given(range(40), after, 10), "t.json")
+    assert re.search("as of images counted by themselves, .*; if all are of one film, count all", line)
+    for train, test, of in (
+        (range(40), range(10), 10),
+        (between, range(4, 40, 8), None),
+        (range(40), after, None),
+    ):
+        assert check_times(given(train, test, of), "t.json") == []  # each from 0, and all together
+
+
 def test_times_under_another_key_are_named(tmp_path):
     folder = write_dnerf(tmp_path / "toy")
     for file in folder.glob("*.json"):

@@ -273,7 +273,8 @@ def _read_records(
     times, told = times_of(names, [record.time for record in everything], str(folder), name_pattern, cameras)
     assumed += [told] if told else []
     given = {split: {_name(folder, record): record.time for record in records[split]} for split in SPLITS}
-    check_times(given, str(folder), dict(zip(names, cameras)))
+    if name_pattern is None:
+        assumed += check_times(given, str(folder), dict(zip(names, cameras)))
     each = iter(times)
     records = {split: [replace(record, time=next(each)) for record in records[split]] for split in SPLITS}
     if not records["test"]:

@@ -259,7 +259,7 @@ def read_scene(
     splits = {"train": train, "val": test}
     numbered = {split: {f.name: numbers[f.name] for f in part} for split, part in splits.items()}
     by_name = {f.name: f.camera for f in (*train, *test)}
-    check_times(numbered, str(folder / "metadata.json"), by_name)
+    assumed += check_times(numbered, str(folder / "metadata.json"), by_name)
     if first == last:
         assumed.append(f"{folder / 'metadata.json'}: all items are of time {first}: one moment")
     canonical, points = middle_of(f.time for f in train), folder / "points.npy"

@@ -231,7 +231,8 @@ def read_scene(
     if parts["val"] and parts["val"] == parts["test"]:
         assumed.append(f"{file}: val_filenames equals test_filenames: validation is on the test frames")
     of_splits = {split: {e.name: given[e.name] for e in part} for split, part in parts.items()}
-    check_times(of_splits, str(file), {e.name: e.camera for e in entries})
+    if name_pattern is None:
+        assumed += check_times(of_splits, str(file), {e.name: e.camera for e in entries})
     near, far = number_or_none(near, "data.near"), number_or_none(far, "data.far", 1 / MOST_UNITS)
     near = number_or_none(content.get("near"), f"{file}: near") if near is None else near
     far = number_or_none(content.get("far"), f"{file}: far", 1 / MOST_UNITS) if far is None else far

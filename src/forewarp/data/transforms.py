@@ -37,7 +37,7 @@ from forewarp.data.files import (
     side_files,
 )
 from forewarp.data.images import TURN, Header, by, exif_turned, inspect_image
-from forewarp.data.names import LEAST_SPAN, in_order, read_names, refuse_far
+from forewarp.data.names import LEAST_SPAN, in_order, name_parts, read_names, refuse_far
 from forewarp.ops.backend import is_number
 from forewarp.scene.camera import Camera, Lens
 
@@ -79,6 +79,7 @@ _OUTSIDE = 0.9  # share of a side beyond which a principal point is another imag
 _TIMES = ("timestamp", "time_stamp", "frame_time", "time_id", "t", "frame_id", "frame")  # of programs
 _MOST_TIME = 1e20
 _OWN_NUMBERS = 0.5  # share of training's span that frames of an own numbering leave, and of these that tell
+_LEAST_EVEN, _OWN_STEPS = 3, 2.0  # frames of even times that tell; steps by which a split's differ, at least
 _LEAST_UNIT = 0.5  # of all times, that those in [0, 1] span
 _ROUNDING = 1e-6  # beyond 0 and 1
 _FEW = 0.1  # share of the frames, one at least, whose times are in doubt where those of all others agree
@@ -674,23 +675,29 @@ def _views_of(cameras: Sequence[Camera]) -> list[list[float]]:
 
 def check_times(
     splits: Mapping[str, Mapping[str, float | None]], where: str, cameras: Mapping[str, Camera] | None = None
-) -> None:
+) -> list[str]:
     """Refuse times in two units, or a few far from all others: ``times_of`` would squeeze the rest; and those
-    of a split that counts its own images, as cameras on one path tell.
+    of a split that counts its own images, as cameras on one path or images between its own tell.
 
     Args:
         splits: of each split the frames' names and what the file says of their times.
         where: the file, for errors.
         cameras: of the frames, by name.
 
+    Returns:
+        a line where a split seems to count its own images, which follow those of training.
+
     Raises:
         SceneError: naming a frame, where times are to be scaled to [0, 1] and three or more would span next
             to nothing, all but the farthest or those of training, or a split's that lie in [0, 1] less than
-            half of it.
+            half of it; and the times of a split of which ``_of_own_numbers`` tells that.
     """
     named = {name: time for times in splits.values() for name, time in times.items()}
-    if None in named.values() or _within_unit(named.values()):
-        return
+    if None in named.values():
+        return []
+    lines = [line for split in splits for line in _of_own_numbers(splits, split, where)]
+    if _within_unit(named.values()):
+        return lines
     times = sorted({*named.values()})
     whole = times[-1] - times[0]
     advice = "write all times in one unit, or from 0 to 1"
@@ -721,6 +728,36 @@ def check_times(
             got = f"{min(some):.10g} to {max(some):.10g}, where the camera was at other times of training"
             expected = f"one numbering of all images, {times[0]:.10g} to {times[-1]:.10g}"
             raise mismatch(f"{where}: times of {split} frames", expected, got, "count all images together")
+    return lines
+
+
+def _of_own_numbers(splits: Mapping[str, Mapping[str, float]], split: str, where: str) -> list[str]:
+    """Refuse times of a split that are even in the numbers of its images' names, as those of training are,
+    but not together with these, although no number is in both; say so in a line where its images come before
+    or after all others, as those of another film might.
+    """
+    train, of = ({_last_number(name): time for name, time in splits[key].items()} for key in ("train", split))
+    if split == "train" or min(len(train), len(of)) < _LEAST_EVEN or {None, *train} & {*of}:
+        return []
+    (number, time), (other, at) = (np.array([*some.items()]).T for some in (train, of))
+    (rate, start), (own, _) = fits = [np.polyfit(*some, 1) for some in ((number, time), (other, at))]
+    errors = [np.abs(np.polyval(fit, n) - t).max() for fit, n, t in zip(fits, (number, other), (time, at))]
+    off, step = np.abs(rate * other + start - at).max(), _OWN_STEPS * abs(rate)
+    if max(errors) > step / 2 or off <= step or min(rate, own) <= 0:
+        return []
+    first, last = (float(np.polyval((rate, start), n)) for n in (other.min(), other.max()))
+    expected = f"{first:.4g} to {last:.4g} by their numbers, as of training"
+    got = f"{at.min():.4g} to {at.max():.4g}, as of images counted by themselves"
+    if other.min() < number.max() and number.min() < other.max():
+        advice = "count all images together"
+        raise mismatch(f"{where}: times of {split} frames", expected, got, advice)
+    line = f"times of {split} frames are {got}, and {expected}"
+    return [f"{where}: {line}; if all are of one film, count all images together"]
+
+
+def _last_number(name: str) -> float | None:
+    """Return the last number of a name, None without."""
+    return (name_parts(name)[1::2] or [None])[-1]
 
 
 def _counts_itself(
