@@ -15,10 +15,11 @@ from forewarp.data.images import is_premultiplied, straight, write_image
 from forewarp.scene.box import Box
 from forewarp.scene.camera import Camera, look_at
 from forewarp.scene.frame import Frame, sightings, walk_of
-from tests.support.room import shown, walk
+from tests.support.room import BALLS, shown, walk
 from tests.support.tiny_scene import ball_scene
 from tests.support.written_scenes import (
     MIDDLE,
+    UP,
     dnerf_shots,
     dome,
     dome_frames,
@@ -537,3 +538,37 @@ def test_poses_in_which_images_of_a_walk_do_not_agree_are_doubted(tmp_path, keys
     lines = [line for line in remarks(posed_video.read_scene(tmp_path, "toy")) if "images agree" in line]
     assert len(lines) == (said is not None)
     assert (said or "") in "".join(lines)
+
+
+def orbit(count, wide, size=(64, 48), cut_out=False):
+    """A film around the room's balls, over ``wide`` degrees: from within the room, or cut out, from afar."""
+    frames, balls = [], [(torch.tensor(middle, dtype=torch.float64), radius) for middle, radius in BALLS]
+    away = 4.0 if cut_out else 1.5
+    for i, angle in enumerate(np.deg2rad(np.linspace(0, wide, count))):
+        place = [0.3 + away * np.cos(angle), 0.5 + away * np.sin(angle), 1.4]
+        pose = look_at(place, [0.3, 0.5, 0.6], UP).double()
+        camera = Camera(*size, 0.8 * size[0], 0.8 * size[0], size[0] / 2, size[1] / 2, pose, 0.2, 9.0)
+        if cut_out:
+            rays = camera.rays(dtype=torch.float64)
+            aside = [torch.linalg.cross(m - rays.origins, rays.directions).norm(dim=-1) < r for m, r in balls]
+            solid = torch.stack(aside).any(0).view(size[1], size[0], 1)
+            image = (255 * solid.expand(-1, -1, 4)).byte()
+        else:
+            image = torch.from_numpy(shown(camera)[0])
+        frames.append(Frame(f"o_{i:02d}", i / (count - 1), camera, lambda image=image: image))
+    return replace(
+        SCENE, train=tuple(frames), test=(), val=(), box=Box((-3, -3, -3), (3, 3, 3)), has_alpha=cut_out
+    )
+
+
+@pytest.mark.parametrize(("wide", "cut_out"), [(90, False), (720, True)])
+def test_focal_lengths_that_images_around_a_subject_do_not_agree_with_are_doubted(wide, cut_out):
+    scene = orbit(24, wide, cut_out=cut_out)
+    assert not any("agree" in line for line in remarks(scene))
+    cameras = [replace(f.camera, fx=2 * f.camera.fx, fy=2 * f.camera.fy) for f in scene.train]
+    wrong = tuple(replace(frame, camera=camera) for frame, camera in zip(scene.train, cameras))
+    (line,) = (line for line in remarks(replace(scene, train=wrong)) if "agree" in line)
+    what = "silhouettes of " if cut_out else ""
+    assert line.startswith(
+        f"{what}neighbouring images agree much better if focal lengths are 0.5 times as long"
+    )

@@ -11,6 +11,7 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d, grid_sample, interpolate
 
 from forewarp.scene.camera import Camera
+from forewarp.scene.frame import where_seen
 
 # Views of a film that are compared, with others so many later: a share of all, and at least.
 COMPARED, BESIDE = 3, ((0, 0), (24, 2), (8, 6))
@@ -23,6 +24,8 @@ _APART = 1e-3  # least difference of two readings, as a share, that tells
 _WORST = 0.2  # difference of colours in [0, 1] from which on they are of two things
 _LIKELIER, _MOST_PAIRS = 0.75, 0.8  # errors of a likelier reading as a share of the other's; share of pairs
 _FEW = 20  # pixels of a pair of views, fewer of which tell nothing of their largest depths
+_RAYS, _STEPS = 150, 48  # of a silhouette at most, and places on each
+_REACH, _WIDER = 0.9, 1.5  # depth of a subject: of its distance at most, and in its half widths
 _OCCLUDED, _OUTLIER = 0.15, 4.0  # share and multiple of the median error from which another thing is seen
 
 
@@ -60,6 +63,36 @@ def sweep_error(camera: Camera, image: Tensor, other: Camera, shown: Tensor) -> 
     if len(both) < max(_LEAST_PIXELS, _BOTH * len(cost)):
         return torch.inf
     return float(both.clamp(max=_WORST).mean())
+
+
+def silhouette_error(
+    camera: Camera, mask: Tensor, others: Sequence[tuple[Camera, Tensor]], point: Tensor
+) -> float | None:
+    """Return the share of a silhouette's pixels of which no place on the ray is inside all others.
+
+    Args:
+        camera, mask: of a view and its silhouette, (H, W) bool.
+        others: views and their silhouettes, likewise.
+        point: (3,) float64, about which the subject is.
+
+    Returns:
+        the share, None where nothing is in the silhouette.
+    """
+    there = mask.flatten().nonzero()[:, 0]
+    if len(there) == 0:
+        return None
+    there = there[:: max(1, len(there) // _RAYS)]
+    pixels = torch.stack([there % camera.width, there // camera.width], -1) + 0.5
+    aside = float((pixels - camera.project(point[None])[0]).norm(dim=-1).max()) / camera.fx
+    reach = min(_REACH, _WIDER * aside)  # as deep as wide
+    away = float((point - camera.center).norm()) * torch.linspace(1 - reach, 1 + reach, _STEPS).double()
+    rays = camera.rays(there, dtype=torch.float64)
+    points = (rays.origins[:, None] + away[:, None] * rays.directions[:, None]).flatten(0, 1)
+    inside = torch.ones(len(points), dtype=torch.bool)
+    for other, shown in others:
+        row, column, seen = where_seen(other, points)
+        inside &= seen & shown[row.clamp(0, other.height - 1), column.clamp(0, other.width - 1)]
+    return 1 - float(inside.view(-1, _STEPS).any(1).double().mean())
 
 
 def _swept(

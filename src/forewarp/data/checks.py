@@ -10,7 +10,7 @@ from itertools import combinations
 import torch
 from torch import Tensor
 
-from forewarp.data.agreement import BESIDE, COMPARED, likeliest, small_image, sweep_error
+from forewarp.data.agreement import BESIDE, COMPARED, likeliest, silhouette_error, small_image, sweep_error
 from forewarp.data.cameras import IN_PIXELS, WIDEST, degrees_of, nine_pixels
 from forewarp.data.directions import common_point, readings_of
 from forewarp.data.files import SceneError, mismatch
@@ -34,6 +34,10 @@ _CORNER = 0.05  # shares of the sides from the corner, which are rather from the
 _STRETCHED, _SAME_PLACE = 1.25, 1e-9  # sides of a pixel; share of the cameras' distance from the origin
 _AROUND = 2  # half a side of a subject's box in distances of the farthest camera from what they look at
 _WALKED, _SLOW = 5, 1  # degrees around what a film shows, in all and a second, that are too few
+_FAR_PAIRS = 8  # of a film around a subject
+_VIEWS, _FACTORS = 12, (16 / 9, 9 / 16, 0.5, 0.75, 4 / 3, 2.0)  # images; focal lengths, the likeliest first
+_LIKELIER, _MISSED = 0.8, 0.01  # pixels outside other silhouettes: share of those as read, and less by these
+_LONGER = "if focal lengths are {:.3g} times as long"
 _CUT_OFF, _FEW = 0.1, 0.5  # share of the subject beyond the box; of pixels and points that is too few
 # What mends near or far, the box, and all three, by format; "" is any other.
 _REMEDIES = {
@@ -83,8 +87,8 @@ def remarks(scene: Scene) -> Iterator[str]:
         line = f"all test times, {min(beyond):.4g} to {max(beyond):.4g}, lie outside training's"
         advice = "of which alone motion is learnt; give images of one moment one time"
         yield f"{line}, {first:.4g} to {last:.4g}, {advice}"
-    if not aside and aim is None and scene.has_one_camera and not scene.has_alpha:
-        yield from _turned_poses(scene)
+    if not aside and scene.has_one_camera and not scene.has_alpha:
+        yield from _turned_poses(scene, aim is not None)
     walk = None if aside else walk_of(scene)
     if walk is not None and (walk[0] < _WALKED or (walk[1] or _SLOW) < _SLOW):
         speed = "" if walk[1] is None else f", {walk[1]:.2g} a second"
@@ -92,7 +96,7 @@ def remarks(scene: Scene) -> Iterator[str]:
         line += " that stands still, which tells little of depth"
         yield f"{line}; other views of what moves will be guesses"
     if scene.has_alpha:
-        yield from _silhouettes(scene, bounded=not aside)
+        yield from _silhouettes(scene, None if aside else aim, bounded=not aside)
     if masked := [frame.load_valid for frame in scene.train if frame.load_valid is not None]:
         shares = [float(masked[i]().float().mean()) for i in spread(len(masked), _LOOKED_AT)]
         share = sum(shares) / len(shares)
@@ -210,40 +214,91 @@ def _aimed(scene: Scene, aim: Tensor) -> Iterator[str]:
             yield f"{point} is {distance} away, with {key} at {at}; {_remedy(scene, key)}"
 
 
-def _turned_poses(scene: Scene) -> Iterator[str]:
-    """Say that images of a film agree much better with poses or focal lengths in another way."""
+def _turned_poses(scene: Scene, aimed: bool) -> Iterator[str]:
+    """Say that images of a film agree much better with poses or focal lengths in another way, or with the
+    latter alone where cameras are ``aimed`` at one point.
+    """
     frames = sorted(scene.train, key=lambda frame: frame.time)
     steps = [max(least, len(frames) // share) if share else 0 for share, least in BESIDE]
-    groups = [[frames[i + n] for n in steps if i + n < len(frames)] for i in spread(len(frames), COMPARED)]
-    pairs = [pair for group in groups for pair in combinations(group, 2)]
-    first = [*combinations(groups[len(groups) // 2], 2)]
-    images = {id(frame): small_image(frame.load()) for group in groups for frame in group}
+    if aimed:  # views far apart tell the focal length, those beside each other next to nothing
+        pairs = [(frames[i], frames[i + steps[-1]]) for i in spread(len(frames) - steps[-1], _FAR_PAIRS)]
+        first = pairs[::3]
+    else:
+        groups = [
+            [frames[i + n] for n in steps if i + n < len(frames)] for i in spread(len(frames), COMPARED)
+        ]
+        pairs = [pair for group in groups for pair in combinations(group, 2)]
+        first = [*combinations(groups[len(groups) // 2], 2)]
+    images: dict[str, Tensor] = {}
 
     def view(frame: Frame, read: Callable[[Camera], Camera]) -> tuple[Camera, Tensor]:
-        image = images[id(frame)]
+        if frame.name not in images:
+            images[frame.name] = small_image(frame.load())
+        image = images[frame.name]
         camera = read(scene.world.camera_to_data(replace(frame.camera, lens=None)))  # as it is slow
         return camera.resized(image.shape[1], image.shape[0]), image
 
     def errors(pairs: list[tuple[Frame, Frame]], read: Callable[[Camera], Camera]) -> list[float]:
         return [sweep_error(*view(one, read), *view(other, read)) for one, other in pairs]
 
-    changes = readings_of(scene.protocol.get("dataset"))
+    changes = {} if aimed else readings_of(scene.protocol.get("dataset"))
     readings = {
         how: lambda c, change=change: replace(c, camera_to_world=change(c.camera_to_world[None])[0])
         for how, change in changes.items()
     }
     for factor in (0.5, 2.0):
-        key = f"if focal lengths are {factor:g} times as long"
-        readings[key] = lambda c, by=factor: replace(c, fx=by * c.fx, fy=by * c.fy)
+        readings[_LONGER.format(factor)] = lambda c, by=factor: _zoomed(c, by)
     for some in (first, pairs):  # most scenes are right, and some pairs tell it
-        mine, others = (
-            errors(some, lambda c: c),
-            {how: errors(some, read) for how, read in readings.items()},
-        )
+        mine = errors(some, lambda c: c)
+        if aimed:  # views that show nothing of each other tell nothing of focal lengths
+            some = [pair for pair, error in zip(some, mine) if error < torch.inf]
+            if len(some) <= len(mine) / 2:
+                return
+            mine = [error for error in mine if error < torch.inf]
+        others = {how: errors(some, read) for how, read in readings.items()}
         how = likeliest(mine, others)
         if how is None:
             return
     yield f"neighbouring images agree much better {how}; compare poses and focal lengths with others"
+
+
+def _zoomed(camera: Camera, factor: float) -> Camera:
+    return replace(camera, fx=factor * camera.fx, fy=factor * camera.fy)
+
+
+def _other_focal(scene: Scene, aim: Tensor) -> Iterator[str]:
+    """Say that silhouettes around the point (3,) that cameras look at agree much better with other focal
+    lengths: those of images of half or twice the size, or of another shape.
+    """
+    frames = sorted(scene.train, key=lambda frame: frame.time)
+    rows = spread(len(frames), _VIEWS)
+    views: dict[int, tuple[Camera, Tensor]] = {}
+
+    def view(row: int, factor: float) -> tuple[Camera, Tensor]:
+        if row not in views:
+            mask = small_image(frames[row].load()[..., 3:].expand(-1, -1, 3))[..., 0] > 0.5
+            camera = replace(frames[row].camera, lens=None)
+            views[row] = camera.resized(mask.shape[1], mask.shape[0]), mask
+        return _zoomed(views[row][0], factor), views[row][1]
+
+    def errors(rows: Sequence[int], factor: float) -> Tensor:
+        beside = {row: [row + n for n in (-2, -1, 1, 2) if 0 <= row + n < len(frames)] for row in rows}
+        each = (
+            silhouette_error(*view(row, factor), [view(n, factor) for n in near], aim)
+            for row, near in beside.items()
+        )
+        return torch.tensor([error for error in each if error is not None], dtype=torch.float64)
+
+    for some, factors in ((rows[::2], _FACTORS[:2]), (rows, _FACTORS)):
+        mine, others = errors(some, 1.0), {factor: errors(some, factor) for factor in factors}
+        if len(mine) == 0:
+            return
+        factor = min(others, key=lambda factor: float(others[factor].mean()))
+        less = float((mine - others[factor]).sign().mean())
+        if float(others[factor].mean()) > min(_LIKELIER * mine.mean(), mine.mean() - _MISSED) or less < _FEW:
+            return
+    how = _LONGER.format(factor)
+    yield f"silhouettes of neighbouring images agree much better {how}; compare focal lengths with others"
 
 
 def _remedy(scene: Scene, key: str) -> str:
@@ -269,9 +324,10 @@ def _in_file(scene: Scene, place: Sequence[float]) -> str:
     return f"({', '.join(f'{round(value, 9) + 0.0:.4g}' for value in values)})"
 
 
-def _silhouettes(scene: Scene, *, bounded: bool) -> Iterator[str]:
+def _silhouettes(scene: Scene, aim: Tensor | None, *, bounded: bool) -> Iterator[str]:
     """Look at the alpha of a few training images: does it cut out a subject, and, if ``bounded``, is that in
-    the box? The subject is where alpha is above half of its greatest value, also of smoke or glass.
+    the box, and of which focal lengths? The subject is where alpha is above half of its greatest value, also
+    of smoke or glass; ``aim`` (3,) what cameras look at.
     """
     frames = [scene.train[i] for i in spread(len(scene.train), _LOOKED_AT)]
     alphas = [frame.load()[..., 3].clone() for frame in frames]
@@ -305,6 +361,8 @@ def _silhouettes(scene: Scene, *, bounded: bool) -> Iterator[str]:
     if missed > _CUT_OFF * total:
         line = f"{missed / total:.0%} of the subject's pixels see nothing of the box {bounds(scene)}"
         yield f"{line} between near and far; {_remedy(scene, 'all')}"
+    elif aim is not None:
+        yield from _other_focal(scene, aim)
 
 
 def _apart(scene: Scene) -> Iterator[str]:
