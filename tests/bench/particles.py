@@ -125,7 +125,7 @@ def run_of(size: Size, steps: int, folder: Path, effects: Sequence[str] = ()) ->
     nodes = size.nodes / math.sqrt(size.particles)
     config = composed(
         "model=particles", "trainer=cpu", "~stage.coarse", "callbacks.pictures=null", f"run={folder}",
-        "budget.minutes=null", f"budget.iterations={steps}", f"stage.fine.nodes={nodes}",
+        "budget.minutes=null", f"budget.iterations={steps}", f"stage.fine.deformation.nodes={nodes}",
         "stage.fine.initial_share=1.0", "stage.fine.density_interval=1.0", "stage.fine.density=1000",
         "stage.fine.crowd_decay=0.0", *effects,  # as hook, which has fewer particles than pixels
     )  # fmt: skip
@@ -142,16 +142,16 @@ def _made(make: Callable[[Start], Particles], start: Start, size: Size) -> Parti
     cloud = Cloud(particles.means, torch.full_like(particles.means, 0.5), torch.ones(size.particles), apart)
     method = make(replace(start, handover=Handover(BOX, True, TIMES, cloud)))
     if not start.blank:
-        method.scales.copy_(particles.log_scales)
-        method.quaternions.copy_(particles.quaternions)
-        method.opacity.copy_(particles.opacity)
-        method.colors.copy_(particles.colors[:, :1])
-        if method.nodes is not None:
+        method.gaussians.scales.copy_(particles.log_scales)
+        method.gaussians.quaternions.copy_(particles.quaternions)
+        method.gaussians.opacity.copy_(particles.opacity)
+        method.gaussians.colors.copy_(particles.colors[:, :1])
+        if method.deformation is not None:
             draw = torch.Generator().manual_seed(1)
-            for curves in (method.nodes.translations, method.nodes.rotations):
+            for curves in (method.deformation.nodes.translations, method.deformation.nodes.rotations):
                 if curves is not None:
                     curves.copy_(0.02 * torch.randn(curves.shape, generator=draw))
-            method.nodes.seen_times.copy_(torch.tensor([0.0, 1.0]))
+            method.deformation.nodes.seen_times.copy_(torch.tensor([0.0, 1.0]))
     return method
 
 
@@ -306,12 +306,14 @@ def plain_times(loop: Loop, size: Size) -> dict[str, float]:
     """
     method, smaller = loop.method, max(1, size.side // SMALLER)
     view, times = camera(size.side, 0.3), (size.side / smaller) ** 2
-    color_basis, opacity_basis = method.time_bases(MIDDLE)
-    particles, warp = (type(p)(*(t.detach() for t in p)) for p in (method.gaussians(), method.warp(MIDDLE)))
+    color_basis, opacity_basis = method.gaussians.time_bases(MIDDLE)
+    particles, warp = (
+        type(p)(*(t.detach() for t in p)) for p in (method.gaussians.joined(), method.warp(MIDDLE))
+    )
     seen = (particles, warp, pinhole_of(view, method.blur), color_basis, opacity_basis)
     little = (*seen[:2], pinhole_of(camera(smaller, 0.3), method.blur), *seen[3:])
     truth = torch.zeros(smaller**2, 4, dtype=torch.uint8)
-    nodes, found = method.nodes, {}
+    nodes, found = method.deformation.nodes, {}
     with implementation("reference"):
         found["projection"] = timed(lambda: project(*seen), FEW)
         splats = Splats(*(t.detach() for t in project(*little)))
@@ -320,7 +322,7 @@ def plain_times(loop: Loop, size: Size) -> dict[str, float]:
         leaves = Gaussians(*(part.clone().requires_grad_() for part in particles))
         numbers = project(leaves, *seen[1:]).values.sum()
         found["chain, back to particles and nodes"] = timed(lambda: numbers.backward(retain_graph=True), FEW)
-        skin = method.skinning
+        skin = method.deformation.skinning
         found["weights of nodes"] = timed(lambda: skin_weights(skin.shares, skin.logits.detach()), FEW)
         motion, maps = nodes.motion_and_maps(nodes.curve(MIDDLE))
         pulled = (motion.detach(), nodes.positions, maps.detach(), nodes.edges, nodes.edge_weights, 1.0)

@@ -27,13 +27,15 @@ MEASURE = "(size) => forewarp.then((door) => door.measure({ width: size, height:
 def repeated(source: Source, count: int) -> Source:
     """The same scene of so many particles."""
     module = copy.deepcopy(source.module)
-    rows = torch.arange(count) % len(module.method.means)
+    rows = torch.arange(count) % len(module.method.gaussians.means)
     for name in module.method.grows:
         part = part_of(module.method, name)
         part.data = part.data[rows]
-    means, scales = module.method.means.data, module.method.scales.data
+    means, scales = module.method.gaussians.means.data, module.method.gaussians.scales.data
     means += scales.exp() * torch.randn(means.shape, generator=torch.Generator().manual_seed(0))
-    scales -= 0.5 * math.log(max(1.0, count / len(source.module.method.means)))  # as much area in all
+    scales -= 0.5 * math.log(
+        max(1.0, count / len(source.module.method.gaussians.means))
+    )  # as much area in all
     return replace(source, module=module)
 
 

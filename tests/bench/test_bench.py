@@ -85,12 +85,12 @@ def loop():
 
 @pytest.mark.slow
 def test_the_figure_is_as_large_as_asked_and_stays_so(loop):
-    assert (len(loop.method.means), len(loop.method.nodes.positions)) == (300, 9)
-    before = loop.method.means.detach().clone()
+    assert (len(loop.method.gaussians.means), len(loop.method.deformation.nodes.positions)) == (300, 9)
+    before = loop.method.gaussians.means.detach().clone()
     for _ in range(3):
         loop.step()
-    assert len(loop.method.means) == 300
-    assert float((loop.method.means.detach() - before).abs().max()) > 0
+    assert len(loop.method.gaussians.means) == 300
+    assert float((loop.method.gaussians.means.detach() - before).abs().max()) > 0
     assert loop.picture().shape == (32 * 32, 3)
     assert figure(100)[1] == pytest.approx(2 * figure(400)[1])  # a quarter as many are twice as far apart
 

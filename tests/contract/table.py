@@ -97,13 +97,13 @@ WARP = {
     "background": BACKGROUND,
 }
 OF_PARTICLES = {
-    "motion": Effect({"motion": "spline"}, calls(Nodes, "motion_and_maps", "backward"), ("nodes",)),
-    "rotation": Effect({"rotation": True}, (), ("nodes.rotations",)),
-    "view_dependence": Effect({"view_dependence": 1}, (), ("sh",)),
-    "color_over_time": Effect({"color_over_time": 1}, ()),
-    "opacity_over_time": Effect({"opacity_over_time": 1}, ()),
+    "motion": Effect({"motion": "spline"}, calls(Nodes, "motion_and_maps", "backward"), ("deformation",)),
+    "rotation": Effect({"rotation": True}, (), ("deformation.nodes.rotations",)),
+    "view_dependence": Effect({"view_dependence": 1}, (), ("gaussians.sh",)),
+    "color_over_time": Effect({"color_over_time": 1}, (), ("gaussians.color_over_time",)),
+    "opacity_over_time": Effect({"opacity_over_time": 1}, (), ("gaussians.opacity_over_time",)),
     "exposure": Effect({"exposure": 1}, calls(exposure, "gain_and_bias", "lit", "to_unlit")),
-    "background": Effect({"background": 0.03}, (), ("resting", "nodes.stopped")),
+    "background": Effect({"background": 0.03}, (), ("deformation.resting", "deformation.nodes.stopped")),
 }
 RATES = {"means": 1.5e-3, "scales": 5e-3, "quaternions": 3e-3, "opacity": 5e-2, "colors": 3e-2, "sh": 1e-3}
 RATES |= {"color_over_time": 1e-3, "opacity_over_time": 3e-3, "skinning": 1e-2, "time_offsets": 0.3}

@@ -24,15 +24,15 @@ DATA = small_data()
 def test_a_layer_without_particles_is_refused_unless_it_will_do():
     method, frames = module_with(DATA).method, DATA.scene.train
     assert layer_of(method, "all", frames) is method
-    assert len(layer_of(method, "resting", frames).means) == len(method.means)
+    assert len(layer_of(method, "resting", frames).gaussians.means) == len(method.gaussians.means)
     with pytest.raises(ValueError, match="layer: expected some particles that move, but got none in this"):
         layer_of(method, "moving", frames)
-    assert len(layer_of(method, "moving", frames, may_be_empty=True).means) == 0
+    assert len(layer_of(method, "moving", frames, may_be_empty=True).gaussians.means) == 0
 
 
 def test_a_film_of_a_layer_has_the_masks_of_the_whole_scene(tmp_path, monkeypatch):
     module = shaken(module_with(DATA, **EVERY))
-    rows = torch.arange(len(module.method.means)) % 2 == 0
+    rows = torch.arange(len(module.method.gaussians.means)) % 2 == 0
     monkeypatch.setattr(type(module.method), "in_motion", lambda self, frames: rows)
     method, config = module.method, OmegaConf.load(CONF / "render.yaml")
     config.update({"masks": "true", "layer": "moving", "frames": 3, "size": 24, "format": "png"})
@@ -43,7 +43,7 @@ def test_a_film_of_a_layer_has_the_masks_of_the_whole_scene(tmp_path, monkeypatc
     film = write_film(config, SimpleNamespace(folder=tmp_path, datamodule=DATA), module)
     assert film == tmp_path / "videos" / "fixed_moving"
     assert not any(file.exists() for file in older)
-    assert len(module.method.means) == int(rows.sum())
+    assert len(module.method.gaussians.means) == int(rows.sum())
     masks = [iio.imread(tmp_path / "videos" / "fixed_moving_masks" / f"{i:04d}.png") for i in range(3)]
     camera = DATA.targets("test")[0].frame.camera.resized(24, 24)
     for mask, time in zip(masks, (0.0, 0.5, 1.0)):

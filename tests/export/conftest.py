@@ -26,7 +26,7 @@ def exporter(kind, **defaults):
 def _particles():
     data = small_data()
     module = shaken(module_with(data, **EVERY | {"view_dependence": 2}))
-    module.method.opacity.data += 1
+    module.method.gaussians.opacity.data += 1
     return Source(module, "particles", [frame.camera for frame in data.scene.train], TIMES)
 
 

@@ -91,7 +91,7 @@ def test_particles_go_as_their_centers_with_colours_and_opacity_of_each_time(par
             np.testing.assert_allclose(tracks[name][:, row], wanted, atol=1e-6)
         np.testing.assert_allclose(tracks["opacity"][:, row], cloud.opacity, atol=1e-6)
     assert np.ptp(tracks["opacity"], 1).max() > 0.05
-    np.testing.assert_array_equal(method["means"], particles.method.means.detach())
+    np.testing.assert_array_equal(method["gaussians.means"], particles.method.gaussians.means.detach())
 
 
 TYPES = {5126: np.float32, 5125: np.uint32}

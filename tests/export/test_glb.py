@@ -59,12 +59,12 @@ def test_what_no_training_image_shows_is_left_out_of_compact_files_and_not_misse
     times = np.linspace(0, 1, len(particles.cameras)).tolist()
     particles = replace(particles, image_times=times)
     method = particles.method
-    method.scales.data[:20] = -9.0
-    method.opacity.data[:20] = -2.0  # specks that make up a hundredth of a pixel
+    method.gaussians.scales.data[:20] = -9.0
+    method.gaussians.opacity.data[:20] = -2.0  # specks that make up a hundredth of a pixel
     about, file = export(particles, tmp_path / "glb")
     assert about["left out"] >= 20
     scene = forewarp.load(file)
-    assert about["particles"] == len(scene.gaussians.means) == len(method.means) - about["left out"]
+    assert about["particles"] == len(scene.gaussians.means) == len(method.gaussians.means) - about["left out"]
     for time, camera in list(zip(times, particles.cameras))[:3]:
         wanted = method.at(Moment(time)).render(View(camera), scene.background).rgb.clamp(0, 1)
         error = scene.render(camera, time).rgb.reshape(-1, 3) - wanted.detach()
@@ -98,8 +98,8 @@ def test_a_method_without_particles_is_told_what_it_can_give(ball, tmp_path):
 
 
 def test_nothing_to_see_is_no_file(particles, tmp_path):
-    particles.method.opacity.data.fill_(-20.0)
-    particles.method.opacity_over_time.data.fill_(0.0)
+    particles.method.gaussians.opacity.data.fill_(-20.0)
+    particles.method.gaussians.opacity_over_time.data.fill_(0.0)
     with pytest.raises(ValueError, match="expected particles that can be seen, but got none"):
         export(particles, tmp_path / "glb")
 

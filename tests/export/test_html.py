@@ -43,7 +43,7 @@ def test_the_page_holds_the_scene_and_fetches_nothing(particles, tmp_path):
     content, facts = packed_scene(particles, "html", quality="lossless", seconds=2.0)
     assert zlib.decompress(base64.b64decode(held), wbits=-15) == content
     assert facts.items() <= about.items()
-    assert facts["moving"] < facts["particles"] <= len(particles.method.means)
+    assert facts["moving"] < facts["particles"] <= len(particles.method.gaussians.means)
     picture = re.search(r'src="data:image/jpeg;base64,([^"]+)"', text)[1]
     camera = particles.cameras[0]
     assert iio.imread(base64.b64decode(picture)).shape == (camera.height, camera.width, 3)
@@ -204,7 +204,7 @@ def test_what_is_shown_follows_the_address(particles, opened):
 def test_layers_are_those_of_the_run(opened):
     data = small_data()
     module = module_with(data, **EVERY)
-    nodes, frames = module.method.nodes, data.scene.train
+    nodes, frames = module.method.deformation.nodes, data.scene.train
     right = nodes.positions[:, 0] > nodes.positions[:, 0].median()
     nodes.translations.data[right] += torch.linspace(-0.6, 0.6, nodes.curve.count)[:, None]
     times = [frame.time for frame in frames]

@@ -98,7 +98,7 @@ def test_a_viewer_draws_the_images_of_the_run_and_the_motion_moves_the_canonical
     for number, (time, camera) in enumerate(zip(TIMES, particles.cameras)):
         frame = read(folder / "frames" / f"frame_{number:04d}.ply")
         assert list(frame) == LAYOUT
-        assert len(frame["x"]) == about["particles"] == len(particles.method.means)
+        assert len(frame["x"]) == about["particles"] == len(particles.method.gaussians.means)
         snapshot = particles.method.at(Moment(time))
         wanted = snapshot.render(View(camera), torch.ones(3)).rgb.detach()
         assert float(wanted.std()) > 0.05
@@ -329,7 +329,7 @@ def test_particles_have_their_opacity_at_the_vertices(particles, tmp_path):
 
 
 def test_nothing_found_is_one_line(particles, tmp_path, monkeypatch):
-    particles.method.opacity.data -= 2
+    particles.method.gaussians.opacity.data -= 2
     between = "level: expected a number between the lowest and the highest opacity at time 0, "
     with pytest.raises(ValueError, match=between + r"0 and 0\.\d+, but got 0.9"):
         export_mesh(particles, tmp_path / "mesh", level=0.9)

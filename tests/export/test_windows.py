@@ -13,7 +13,7 @@ from forewarp.export.tracks import Source
 from forewarp.fields.windows import MovingWindows, check_windows
 from forewarp.glb.reader import read
 from forewarp.methods.method import Start
-from forewarp.methods.particles import shared
+from forewarp.methods.particles import windows as particle_windows
 from forewarp.methods.particles.model import Particles
 from forewarp.metrics.image import psnr
 from forewarp.runs.windows import check_film
@@ -49,14 +49,14 @@ def film():
         module = module_with(data, **EVERY)
         start = Start(data.scene, "fine", numbers, list(range(len(cameras))), None, still, shares=True)
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(shared, "wrong_pixels", below)
+            patch.setattr(particle_windows, "wrong_pixels", below)
             module.method = method = Particles(start, **EVERY)
         own = method.shared < 0
-        for p in (method.means, method.opacity):
+        for p in (method.gaussians.means, method.gaussians.opacity):
             p.data[own] += 0.1 * torch.randn(p[own].shape, generator=generator)
-        paths = method.nodes.translations
+        paths = method.deformation.nodes.translations
         paths.data += 0.1 * torch.randn(paths.shape, generator=generator)
-        method.opacity.data[own] += 1
+        method.gaussians.opacity.data[own] += 1
         taken = torch.linspace(0, 1, len(cameras)).tolist()
         sources.append(Source(module, "particles", cameras, (0.0,), (1.0,) * 3, "film", taken, span, begin))
     return replace(sources[0], later=sources[1:])
@@ -112,7 +112,7 @@ def test_what_all_windows_share_is_stored_once(film, written):
     last = [window.gaussians.means[-facts["shared"] :] for window in gaussians.windows]
     assert torch.equal(*last)
     ids, still = film.method.common(), shared_in([film, *film.later])
-    known = {tuple(row) for row in film.method.means[still[0]].tolist()}
+    known = {tuple(row) for row in film.method.gaussians.means[still[0]].tolist()}
     assert {tuple(row) for row in last[0].tolist()} <= known
     assert int((ids >= 0).sum()) >= int(still[0].sum()) >= facts["shared"]
 
@@ -120,7 +120,7 @@ def test_what_all_windows_share_is_stored_once(film, written):
 def test_windows_that_began_from_another_run_are_refused(film):
     """Else those of the first window would be drawn in all."""
     method = copy.deepcopy(film.later[0].method)
-    method.means.data[method.shared >= 0] += 0.1
+    method.gaussians.means.data[method.shared >= 0] += 0.1
     retrained = replace(film.later[0], module=SimpleNamespace(method=method))
     with pytest.raises(ValueError, match="^run: expected windows that begin from the same run, but window 2"):
         shared_in([film, retrained])

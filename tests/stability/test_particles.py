@@ -11,6 +11,7 @@ import torch
 from torch.autograd import gradcheck
 
 from forewarp.methods.particles import model
+from forewarp.methods.particles.gaussians import GaussianModel
 from forewarp.methods.particles.model import pinhole_of
 from forewarp.ops import backend
 from forewarp.ops.adam import AdamState, adam_rows
@@ -185,13 +186,14 @@ def test_places_behind_a_lens():
 
 
 # Of which parameters: without view dependence and lens all there are; with either those that move nothing.
-STILL = {"scales", "quaternions", "opacity", "colors", "sh", "color_over_time", "opacity_over_time"}
-STILL |= {"exposure"}
-MOVING = {"means", "nodes.translations", "nodes.rotations", "skinning.logits"}
+STILL = {f"gaussians.{name}" for name in GaussianModel.ROWS if name != "means"} | {"exposure"}
+NODES = {"deformation.nodes.translations", "deformation.nodes.rotations"}
+MOVING = NODES | {"gaussians.means", "deformation.skinning.logits"}
+SH, ROTATIONS = {"gaussians.sh"}, {"deformation.nodes.rotations"}
 COSINES = {"view_dependence": None, "rotation": None, "motion": "cosines"}
 METHODS = {
-    "splines": ({"view_dependence": None}, {}, STILL - {"sh"} | MOVING),
-    "cosines, no rotation": (COSINES, {}, STILL - {"sh"} | MOVING - {"nodes.rotations"}),
+    "splines": ({"view_dependence": None}, {}, STILL - SH | MOVING),
+    "cosines, no rotation": (COSINES, {}, STILL - SH | MOVING - ROTATIONS),
     "degree 3": ({"view_dependence": 3}, {}, STILL),
     "a lens": ({"view_dependence": 1}, LENS, STILL),
 }
@@ -203,7 +205,9 @@ def exactly(options, lens, monkeypatch):
     numbers = {"jitter": 0.0, "density": 1.0, "initial_share": 1.0, "time_offsets": 0}
     module = module_with(data, numbers=numbers, **EVERY | options)
     method = shaken(module).method.double()
-    method.nodes.seen_times.copy_(torch.tensor([0.0, 1.0]))  # else the first look continues curves
+    method.deformation.nodes.seen_times.copy_(
+        torch.tensor([0.0, 1.0])
+    )  # else the first look continues curves
     monkeypatch.setattr(model, "pinhole_of", lambda camera, blur: replace(pinhole_of(camera, blur), **lens))
     data.picker = lambda: 3
     return method, next(iter(data.train_dataloader())), module.generator
@@ -228,7 +232,7 @@ def test_a_step_of_the_method(name, monkeypatch):
     gradients = method.look(batch, factors, generator).gradients
     parameters = dict(method.named_parameters())
     assert gradients.keys() == parameters.keys()
-    moves = names >= MOVING - {"nodes.rotations"}
+    moves = names >= MOVING - ROTATIONS
     assert names == (parameters.keys() if moves else parameters.keys() - MOVING)
     for which in sorted(names):
         draw = torch.Generator().manual_seed(1)

@@ -10,8 +10,10 @@ import torch
 from forewarp.data.module import SceneDataModule
 from forewarp.fields.curves import Curve
 from forewarp.methods.particles import start
+from forewarp.methods.particles.deformation import Deformation
+from forewarp.methods.particles.gaussians import GaussianModel
 from forewarp.methods.particles.model import Particles
-from forewarp.methods.particles.nodes import Nodes, Skinning
+from forewarp.methods.particles.nodes import Nodes
 from forewarp.ops.gaussians import BLUR
 from forewarp.scene.box import Box
 from forewarp.scene.camera import Lens
@@ -65,7 +67,7 @@ def check_sound(module, losses, scene, steps):
     assert all(0 <= loss < 1e4 for loss in losses)
     for part, value in module.method.state_dict().items():
         assert not value.is_floating_point() or value.isfinite().all(), part
-    assert len(module.method.means) >= 1
+    assert len(module.method.gaussians.means) >= 1
     drawn = module.render(scene.test[0].camera, Moment(0.5), torch.ones(3))
     assert all(plane.isfinite().all() for plane in (drawn.rgb, drawn.depth, drawn.opacity))
 
@@ -81,22 +83,24 @@ def test_hard_scenes_train(tmp_path, name):
 
 def coincide(method):
     """Put all particles at one place, and all nodes."""
-    method.means.data[:] = method.means.data[:1]
-    edges = method.nodes.edges.shape[1]
-    method.nodes.__init__(method.means.data, 6, method.nodes.curve, rests=True, edges=edges)
-    method.skinning.__init__(method.nodes, method.means.data)
+    method.gaussians.means.data[:] = method.gaussians.means.data[:1]
+    points, nodes = method.gaussians.means.data, method.deformation.nodes
+    nodes.__init__(points, 6, nodes.curve, rests=True, edges=nodes.edges.shape[1])
+    method.deformation.skinning.__init__(nodes, points)
 
 
 BAD = {
-    "all outside the view": lambda m: m.means.data.add_(90.0),
-    "all at a camera": lambda m: m.means.data.copy_(SCENE.train[0].camera.center.expand_as(m.means)),
-    "opacity 0": lambda m: m.opacity.data.fill_(-1e4),
-    "opacity 1": lambda m: m.opacity.data.fill_(1e4),
-    "all faded, so that none would be left": lambda m: m.opacity.data.fill_(-5.0),
-    "all faded but one": lambda m: m.opacity.data[1:].fill_(-5.0),
-    "quaternions of length 0": lambda m: m.quaternions.data.zero_(),
-    "scales of 0": lambda m: m.scales.data.fill_(-1e4),
-    "scales of e^40": lambda m: m.scales.data.fill_(40.0),
+    "all outside the view": lambda m: m.gaussians.means.data.add_(90.0),
+    "all at a camera": lambda m: m.gaussians.means.data.copy_(
+        SCENE.train[0].camera.center.expand_as(m.gaussians.means)
+    ),
+    "opacity 0": lambda m: m.gaussians.opacity.data.fill_(-1e4),
+    "opacity 1": lambda m: m.gaussians.opacity.data.fill_(1e4),
+    "all faded, so that none would be left": lambda m: m.gaussians.opacity.data.fill_(-5.0),
+    "all faded but one": lambda m: m.gaussians.opacity.data[1:].fill_(-5.0),
+    "quaternions of length 0": lambda m: m.gaussians.quaternions.data.zero_(),
+    "scales of 0": lambda m: m.gaussians.scales.data.fill_(-1e4),
+    "scales of e^40": lambda m: m.gaussians.scales.data.fill_(40.0),
     "nodes that coincide": coincide,
 }
 
@@ -114,7 +118,7 @@ def test_bad_beginnings_train(tmp_path, monkeypatch, name):
     monkeypatch.setattr(Particles, "__init__", spoiled)
     monkeypatch.setattr(start, "first_points", lambda of, count, shell: start.anywhere(of.scene.box, count))
     module, losses = fit(tmp_path, SCENE, 8, density_interval=0.2, relink=1)
-    assert int(module.method.round) >= 2
+    assert int(module.method.density.round) >= 2
     check_sound(module, losses, SCENE, 8)
 
 
@@ -181,12 +185,12 @@ def test_images_of_two_sizes_say_the_same():
     options = {"model": partial(Particles, **EVERY), "numbers": numbers}
     module, twin = (module_of(ENTRY, of, **options) for of in (data, twins_data))
     method = shaken(module).method
-    method.nodes.seen_times.copy_(torch.tensor([0.0, 1.0]))
+    method.deformation.nodes.seen_times.copy_(torch.tensor([0.0, 1.0]))
     assert float(twin.method.covered_pixels) == 4 * float(method.covered_pixels)
     assert float(twin.method.final_count) == pytest.approx(2 * float(method.final_count), rel=0.02)
     camera = scene.train[3].camera
-    distances = (method.means.data - camera.center.to(method.means)).norm(dim=-1)
-    variance = float((method.scales.data.exp().mean(-1) * camera.fx / distances).square().median())
+    distances = (method.gaussians.means.data - camera.center.to(method.gaussians.means)).norm(dim=-1)
+    variance = float((method.gaussians.scales.data.exp().mean(-1) * camera.fx / distances).square().median())
     most = 2 * BLUR * (1 - 1 / 4) / variance
     assert 0.005 < most < 0.02  # neither demands the impossible nor lets much pass
     other = copy.deepcopy(method)
@@ -211,9 +215,10 @@ def still_particles():
 def paths(nodes, points, times):
     """Where points go that are particles themselves."""
     method = copy.copy(still_particles())  # a shallow copy: what is set below is the copy's
-    method._parameters, method._modules = dict(method._parameters), dict(method._modules)
-    method.nodes, method.skinning = nodes, Skinning(nodes, points)
-    method.means, method.opacity = (torch.nn.Parameter(p) for p in (points, torch.zeros(len(points), 1)))
+    method._modules = dict(method._modules)
+    method.deformation = Deformation(nodes, points)
+    values = method.values() | {"means": points, "opacity": torch.zeros(len(points), 1)}
+    method.gaussians = GaussianModel(values, nodes.curve.canonical_time)
     method.canonical_time = nodes.curve.canonical_time
     return method.trajectories(points, torch.tensor(times, dtype=torch.float64))
 

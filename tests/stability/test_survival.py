@@ -280,7 +280,7 @@ def test_killed_after_density_control(begin, tmp_path):
 
     def particles(folder, stage="fine"):
         content = read(folder / stage / "last.ckpt")
-        return content["global_step"], len(content["state_dict"]["method.means"])
+        return content["global_step"], len(content["state_dict"]["method.gaussians.means"])
 
     whole, run = tmp_path / "whole", tmp_path / "run"
     train(whole)

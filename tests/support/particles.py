@@ -41,8 +41,8 @@ def shaken(module):
     method, generator = module.method, torch.Generator().manual_seed(0)
     for p in method.parameters():
         p.data += 0.1 * torch.randn(p.shape, generator=generator)
-    if method.skinning is not None:
-        method.skinning.release(torch.arange(len(method.means)) % 3 == 0)
+    if method.deformation is not None:
+        method.deformation.skinning.release(torch.arange(len(method.gaussians.means)) % 3 == 0)
     return module
 
 

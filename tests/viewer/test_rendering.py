@@ -126,7 +126,7 @@ def test_a_time_is_warped_to_once_and_what_has_changed_is_forgotten(viewer, stat
 def test_a_layer_shows_its_particles_alone_and_voxels_have_none(viewer, state):
     data = small_data()
     module = shaken(module_with(data, **EVERY))
-    rows = torch.arange(len(module.method.means)) % 2 == 0
+    rows = torch.arange(len(module.method.gaussians.means)) % 2 == 0
     module.method.__class__ = type("Told", (type(module.method),), {"in_motion": lambda self, frames: rows})
     seen, first = Viewer(data.scene, [SceneRenderer("particles", module, data)]), ViewState.first(data.scene)
     assert (seen.layers, viewer.layers) == (("all", "moving", "resting"), ("all",))

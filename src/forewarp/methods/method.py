@@ -108,6 +108,8 @@ class Method(nn.Module):
         grows: dotted names of the parameters and buffers whose number of rows may change during training;
             they adopt a checkpoint's. A part of it may have a ``grows`` of its own.
         loose: those of them that ``misfit`` itself compares with the others, as they have rows of their own.
+        earlier_names: pairs of what a name in ``state_dict`` was in earlier checkpoints, and what it is now;
+            with a dot at the end, the beginnings of such names.
         on_cpu: why ``trainer=auto`` should run it on the CPU, in a few words; None: it should not.
         betas: of Adam.
     """
@@ -120,6 +122,7 @@ class Method(nn.Module):
     still_steps: ClassVar[int | None] = None
     grows: ClassVar[Sequence[str]] = ()
     loose: ClassVar[Sequence[str]] = ()
+    earlier_names: ClassVar[Sequence[tuple[str, str]]] = ()
     on_cpu: ClassVar[str | None] = None
     betas: ClassVar[tuple[float, float]] = (0.9, 0.99)
 
@@ -203,6 +206,17 @@ class Method(nn.Module):
         parts = self.named_modules()
         return {f"{place}." if place else "": part for place, part in parts if hasattr(part, "grows")}
 
+    def current_names(self, state: Mapping[str, Tensor], place: str = "") -> dict[str, Tensor]:
+        """Return a stored ``state_dict`` by today's names; those of the method begin with ``place``."""
+
+        def current(name: str) -> str:
+            for was, now in ((place + was, place + now) for was, now in self.earlier_names):
+                if name == was or (was.endswith(".") and str(name).startswith(was)):
+                    return now + name.removeprefix(was)
+            return name
+
+        return {current(name): value for name, value in state.items()}
+
     def misfit(self, state: Mapping[str, Tensor]) -> str | None:
         """Return the name of a stored entry that contradicts the others; None if there is none.
 
@@ -254,6 +268,9 @@ class Method(nn.Module):
         """
 
     def _load_from_state_dict(self, state_dict, prefix, *args, **kwargs) -> None:
+        state = self.current_names(state_dict, prefix)
+        state_dict.clear()
+        state_dict.update(state)
         for name in self.adopted():  # including those of submodules, which load later
             if prefix + name in state_dict:
                 place, _, last = name.rpartition(".")

@@ -100,6 +100,7 @@ def check_checkpoint(path: Path, module: DynamicSceneModule) -> dict:
         raise ValueError(f"{expected}, but it cannot be read ({error}); delete it") from None
     if not isinstance(content.get("state_dict"), dict):
         raise ValueError(f"{path}: expected a checkpoint, but it holds no weights; delete it")
+    content["state_dict"] = module.method.current_names(content["state_dict"], "method.")
     if differ := misfits(module, content["state_dict"]):
         got = f"one that differs in {', '.join(differ[:3])}"
         advice = "use another run folder, or the configuration that it was made with"

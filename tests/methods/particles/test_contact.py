@@ -8,7 +8,7 @@ import torch
 
 from forewarp.methods.method import Start
 from forewarp.methods.particles.bodies import Poses
-from forewarp.methods.particles.contact import set_down, things_on_the_ground
+from forewarp.methods.particles.contact import place_on_ground, things_on_the_ground
 from forewarp.methods.particles.follow import _again, _body_of, follow, put_on_ground
 from forewarp.methods.particles.model import Particles
 from forewarp.ops.gaussians import FLAT, moved
@@ -40,10 +40,10 @@ def before():
     """A ball at rest, half of whose particles lie on a wall behind it."""
     method = module_with(DATA, **BARE).method
     rays = FRAME.camera.rays(torch.arange(SIZE[0] * SIZE[1]))
-    away = FARTHER * float((method.means.data - FRAME.camera.center.float()).norm(dim=-1).median())
-    count = len(method.means) // 2
+    away = FARTHER * float((method.gaussians.means.data - FRAME.camera.center.float()).norm(dim=-1).median())
+    count = len(method.gaussians.means) // 2
     wall = rays.origins + away * rays.directions
-    method.means.data[:count] = wall[torch.arange(count) % len(wall)]
+    method.gaussians.means.data[:count] = wall[torch.arange(count) % len(wall)]
     return method, away
 
 
@@ -71,9 +71,9 @@ def test_particles_of_what_moves_are_replaced_at_the_distance_of_the_ground(
     monkeypatch.setattr(
         "forewarp.methods.particles.contact.things_on_the_ground", lambda moving, depth: [(mask, away)]
     )
-    old = {name: p.data.clone() for name, p in method.named_parameters(recurse=False)}
-    new = set_down(old, method, scene_with(mask))
-    moves, body_of = new.pop("set_down"), new.pop("body_of")
+    old = {name: value.clone() for name, value in method.values().items()}
+    new = place_on_ground(old, scene_with(mask), method.drawn, method.light_of)
+    moves, body_of = new.pop("is_placed"), new.pop("body_of")
     assert torch.equal(body_of, torch.where(moves & (small > 0.12), 0, -1))
     assert new.keys() == old.keys()
     assert {len(value) for value in new.values()} == {len(moves)}
@@ -95,7 +95,7 @@ def test_particles_of_what_moves_are_replaced_at_the_distance_of_the_ground(
     assert {tuple(place) for place in old["means"][behind].tolist()} <= kept
     assert len(old["means"]) > len(kept) >= int(behind.sum()) > 0
     shared = torch.arange(len(old["means"]))  # a window leaves these as they are
-    new = set_down(old | {"shared": shared}, method, scene_with(mask))
+    new = place_on_ground(old | {"shared": shared}, scene_with(mask), method.drawn, method.light_of)
     assert torch.equal(new["shared"], torch.cat([shared, shared.new_full((int(moves.sum()),), -1)]))
 
 
@@ -110,9 +110,9 @@ def test_particles_of_what_moves_are_replaced_at_the_distance_of_the_ground(
 def test_without_masks_or_known_ground_or_with_measured_depth_nothing_changes(before, changes):
     method, _ = before
     mask = masked((6, 12, 6, 14))
-    old = dict(method.named_parameters(recurse=False))
-    assert set_down(old, method, scene_with(mask)) is not old
-    assert set_down(old, method, scene_with(mask, **changes)) is old
+    old = method.values()
+    assert place_on_ground(old, scene_with(mask), method.drawn, method.light_of) is not old
+    assert place_on_ground(old, scene_with(mask, **changes), method.drawn, method.light_of) is old
 
 
 @pytest.mark.parametrize("trusts", [True, False])
@@ -126,28 +126,30 @@ def test_what_was_set_down_follows_nodes(before, monkeypatch, trusts):
     numbers = {"rest_by_masks": trusts, "bodies": 0.5}
     start = Start(scene, "fine", numbers, list(range(len(scene.train))), None, method, False)
     fine = Particles(start, **MOVING | {"background": 0.03})
-    count = len(fine.means) - len(method.means)
+    count = len(fine.gaussians.means) - len(method.gaussians.means)
     if trusts:
-        fresh = (fine.opacity.data[:, 0] == 2.0).nonzero()[:, 0]
+        fresh = (fine.gaussians.opacity.data[:, 0] == 2.0).nonzero()[:, 0]
         assert len(fresh)
-        assert not bool(fine.resting[fresh].any())
-        assert bool((fine.skinning.shares[fresh].sum(-1) > 0.99).all())
-        assert len(fine.nodes.bodies) == 1
-        followed = fine.nodes.bodies.of_node[fine.skinning.links[fresh].long()]
-        assert bool((followed[fine.skinning.shares[fresh] > 0] == 0).all())
-        assert bool(fine.resting.any())
+        assert not bool(fine.deformation.resting[fresh].any())
+        assert bool((fine.deformation.skinning.shares[fresh].sum(-1) > 0.99).all())
+        assert len(fine.deformation.nodes.bodies) == 1
+        followed = fine.deformation.nodes.bodies.of_node[fine.deformation.skinning.links[fresh].long()]
+        assert bool((followed[fine.deformation.skinning.shares[fresh] > 0] == 0).all())
+        assert bool(fine.deformation.resting.any())
         # An export before the nodes take over has the motion of bodies too, and leaves them the lead.
-        bodies, slow = fine.nodes.bodies, torch.tensor([0.1, 0.0, 0.05])
+        bodies, slow = fine.deformation.nodes.bodies, torch.tensor([0.1, 0.0, 0.05])
         for time in bodies.times:
             bodies.put(time, Poses(torch.eye(3)[None], bodies.rest + time * slow), torch.ones(3))
         for time in bodies.times:
-            exact, written = (moved(fine.means.data, form.warp(time))[0] for form in (fine, fine.moving()))
+            exact, written = (
+                moved(fine.gaussians.means.data, form.warp(time))[0] for form in (fine, fine.moving())
+            )
             torch.testing.assert_close(written, exact, atol=2e-3, rtol=0.0)
-            torch.testing.assert_close(exact[fresh], fine.means.data[fresh] + time * slow)
-        assert fine.nodes.led
+            torch.testing.assert_close(exact[fresh], fine.gaussians.means.data[fresh] + time * slow)
+        assert fine.deformation.nodes.led
     else:
         assert count == 0
-        assert len(fine.nodes.bodies) == 0
+        assert len(fine.deformation.nodes.bodies) == 0
 
 
 def test_a_checkpoint_is_loaded_without_a_look_at_masks(before):
@@ -157,7 +159,7 @@ def test_a_checkpoint_is_loaded_without_a_look_at_masks(before):
     method, _ = before
     scene = scene_with(None, load_moving=unread)
     start = Start(scene, "fine", {"rest_by_masks": True}, [0], None, method, True)
-    assert len(Particles(start, **MOVING).means) == len(method.means)
+    assert len(Particles(start, **MOVING).gaussians) == len(method.gaussians.means)
 
 
 @pytest.fixture
@@ -175,7 +177,7 @@ def led(before, monkeypatch):
 def test_a_body_is_moved_to_where_it_is_as_large_as_shown(led):
     """In the second of four rounds and the others, once each; in the first its shape is not known yet."""
     fine, scene = led
-    bodies, view = fine.nodes.bodies, View(FRAME.camera)
+    bodies, view = fine.deformation.nodes.bodies, View(FRAME.camera)
     moment = Moment(next(time for time in sorted(fine.frames) if not bodies.seen[bodies.row(time)]))
     row = bodies.row(moment.time)
     bodies.seen[row] = True
@@ -188,7 +190,7 @@ def test_a_body_is_moved_to_where_it_is_as_large_as_shown(led):
         fine.progress = progress
         if share is not None:
             bodies.middles[0, row] = eye + share * (there - eye)
-        follow(fine, seen, fine.frames)
+        follow(fine, seen)
         return float((bodies.middles[0, row] - eye).norm() / (there - eye).norm()) - 1
 
     assert abs(off(0.12, 1.05) - 0.05) < 1e-5
@@ -205,16 +207,18 @@ def test_a_body_is_seen_again_beside_where_it_was(led):
     the camera pans.
     """
     fine, scene = led
-    bodies = fine.nodes.bodies
+    bodies = fine.deformation.nodes.bodies
     row = bodies.row(scene.canonical_time)
     held = bodies.middles[:, row]
     before = fine.frames[bodies.times[row]]
     camera = before.camera
     panned = replace(camera, cx=camera.cx + 4)
-    fine.opacity.data.fill_(1.0)
+    fine.gaussians.opacity.data.fill_(1.0)
     image = torch.randint(0, 255, (*SIZE, 3), generator=torch.Generator().manual_seed(0)).to(torch.uint8)
     other = image.flip(0, 1)
-    rows, columns, _ = where_seen(camera, fine.means.data[fine.skinning.shares.sum(-1) > 0])
+    rows, columns, _ = where_seen(
+        camera, fine.gaussians.means.data[fine.deformation.skinning.shares.sum(-1) > 0]
+    )
     window = [slice(int(x.amin()) - 1, int(x.amax()) + 2) for x in (rows, columns)]
     went = [slice(part.start + off, part.stop + off) for part, off in zip(window, (1, 3), strict=True)]
     other[tuple(went)] = image[tuple(window)]
@@ -232,18 +236,18 @@ def test_a_body_is_seen_again_beside_where_it_was(led):
 
 def test_what_rests_beside_a_body_is_not_of_it(led):
     fine, _ = led
-    rests = fine.skinning.shares.sum(-1) == 0
-    fine.skinning.links[rests] = fine.skinning.links[_body_of(fine) == 0][:1]
+    rests = fine.deformation.skinning.shares.sum(-1) == 0
+    fine.deformation.skinning.links[rests] = fine.deformation.skinning.links[_body_of(fine) == 0][:1]
     assert bool(rests.any())
     assert bool((_body_of(fine)[rests] == -1).all())
 
 
 def test_bodies_grow_until_they_touch_the_ground_and_images_stay_alike(led):
     fine, scene = led
-    bodies, view, eye = fine.nodes.bodies, View(FRAME.camera), FRAME.camera.center.float()
+    bodies, view, eye = fine.deformation.nodes.bodies, View(FRAME.camera), FRAME.camera.center.float()
     canonical, time = scene.canonical_time, next(t for t in sorted(fine.frames) if t != scene.canonical_time)
     row, far = bodies.row(time), (bodies.rest - eye).norm(dim=-1)
-    fine.opacity.data[_body_of(fine) < 0] = -20.0  # these would hide them
+    fine.gaussians.opacity.data[_body_of(fine) < 0] = -20.0  # these would hide them
 
     def images():
         canon, turned = (fine.at(Moment(t)).render(view, torch.zeros(3)) for t in (canonical, time))
@@ -251,9 +255,13 @@ def test_bodies_grow_until_they_touch_the_ground_and_images_stay_alike(led):
 
     turn = torch.tensor([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])[None]
     bodies.put(time, Poses(turn, eye + 0.5 * (bodies.rest - eye)), eye)
-    before, means, nodes = images(), fine.means.data.clone(), fine.nodes.positions.clone()
+    before, means, nodes = (
+        images(),
+        fine.gaussians.means.data.clone(),
+        fine.deformation.nodes.positions.clone(),
+    )
     put_on_ground(fine)  # no ground is known
-    assert torch.equal(fine.means.data, means)
+    assert torch.equal(fine.gaussians.means.data, means)
     bodies.farthest[:, row] = 1.2 * 0.5 * far
     put_on_ground(fine)
     for image, other in zip(images(), before, strict=True):
@@ -261,7 +269,7 @@ def test_bodies_grow_until_they_touch_the_ground_and_images_stay_alike(led):
     torch.testing.assert_close((bodies.middles[:, row] - eye).norm(dim=-1), 1.2 * 0.5 * far)
     torch.testing.assert_close((bodies.rest - eye).norm(dim=-1), 1.2 * far)
     grown = torch.where(bodies.of_node >= 0, 1.2, 1.0)[:, None]
-    torch.testing.assert_close(fine.nodes.positions - eye, grown * (nodes - eye))
+    torch.testing.assert_close(fine.deformation.nodes.positions - eye, grown * (nodes - eye))
     bodies.farthest[:, row] = 0.1 * far  # too far already
     put_on_ground(fine)
     torch.testing.assert_close((bodies.rest - eye).norm(dim=-1), 1.2 * far)
@@ -272,7 +280,7 @@ def test_bodies_lead_until_their_share_of_the_stage_is_over(led):
     """A step at an image follows them there, and is of their poses alone; nothing rests before it is over."""
     fine, scene = led
     groups = [{"name": n, "params": p, "lr": 1e-3, "base_lr": 1e-3} for n, p in fine.param_groups().items()]
-    optimizer, bodies = fine.optimizer(groups), fine.nodes.bodies
+    optimizer, bodies = fine.optimizer(groups), fine.deformation.nodes.bodies
     index = max(range(len(scene.train)), key=lambda i: abs(scene.train[i].time - scene.canonical_time))
     time = scene.train[index].time
     assert not bool(bodies.seen[bodies.row(time)])
@@ -280,17 +288,19 @@ def test_bodies_lead_until_their_share_of_the_stage_is_over(led):
         SimpleNamespace(method=fine, generator=torch.Generator()), DATA, index, {"photo": 1.0}
     ).gradients
     assert bool(bodies.seen[bodies.row(time)])
-    assert bool(found["nodes.bodies.twists"][:, bodies.row(time)].any())
-    assert not bool(found["nodes.translations"].any() | found["nodes.rotations"].any())
-    fine.round.fill_(44)
+    assert bool(found["deformation.nodes.bodies.twists"][:, bodies.row(time)].any())
+    assert not bool(
+        found["deformation.nodes.translations"].any() | found["deformation.nodes.rotations"].any()
+    )
+    fine.density.round.fill_(44)
     fine.advance(0.4501, 0, optimizer)
-    assert fine.nodes.led
-    assert not bool(fine.nodes.stopped.any())
-    assert not bool(fine.nodes.translations.any())
+    assert fine.deformation.nodes.led
+    assert not bool(fine.deformation.nodes.stopped.any())
+    assert not bool(fine.deformation.nodes.translations.any())
     row = bodies.row(time)
     bodies.farthest[:, row] = 1.3 * (bodies.middles[:, row] - bodies.eyes[row]).norm(dim=-1)
     fine.advance(0.5, 0, optimizer)
     away = (bodies.middles[:, row] - bodies.eyes[row]).norm(dim=-1)
     torch.testing.assert_close(away, bodies.farthest[:, row])  # put on the ground
-    assert not fine.nodes.led
-    assert bool(fine.nodes.translations.any())
+    assert not fine.deformation.nodes.led
+    assert bool(fine.deformation.nodes.translations.any())

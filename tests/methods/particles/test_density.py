@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from forewarp.methods.effect import switched
-from forewarp.methods.particles import density
-from forewarp.methods.particles.density import _product, _quaternions, come_to_rest, renew, too_near
+from forewarp.methods.particles.deformation import Deformation, _product, _quaternions
+from forewarp.methods.particles.density import too_near
 from forewarp.methods.particles.start import at_rest
 from forewarp.methods.rows import take_rows
 from forewarp.ops.gaussians import moved, rotations
@@ -28,61 +28,76 @@ def few(**options):
     for p in method.parameters():
         p.grad = torch.ones_like(p)
     optimizer.step()
-    method.quaternions.data[:] = torch.tensor([1.0, 0, 0, 0])
-    method.scales.data.fill_(-3.0)
-    method.opacity.data.zero_()
+    method.gaussians.quaternions.data[:] = torch.tensor([1.0, 0, 0, 0])
+    method.gaussians.scales.data.fill_(-3.0)
+    method.gaussians.opacity.data.zero_()
     method.extent.fill_(1.0)
-    method.image_count.fill_(1)
+    method.density.image_count.fill_(1)
     return method, optimizer
+
+
+def to_count(method, count, optimizer):
+    """Run a round of density control, to so many particles."""
+    method.final_count.fill_(count)
+    method.control_density(1.0, optimizer)
+
+
+def freeze(method, least):
+    method.deformation.freeze_static_nodes(method.gaussians, method.ends, least)
 
 
 def test_what_is_pulled_most_is_split_along_its_longest_axis():
     method, optimizer = few()
-    method.scales.data[3, 1] = -1.0
-    method.gradient_sum[3], method.gradient_sum[5] = 7.0, 3.0
-    before, mean = method.scales[3].clone(), method.means[3].clone()
-    renew(method, 11, optimizer)
+    method.gaussians.scales.data[3, 1] = -1.0
+    method.density.gradient_sum[3], method.density.gradient_sum[5] = 7.0, 3.0
+    before, mean = method.gaussians.scales[3].clone(), method.gaussians.means[3].clone()
+    to_count(method, 11, optimizer)
     apart = torch.tensor([0.0, 0.6, 0.0]) * before[1].exp()
-    torch.testing.assert_close(method.means[[3, 10]], torch.stack([mean - apart, mean + apart]))
+    torch.testing.assert_close(method.gaussians.means[[3, 10]], torch.stack([mean - apart, mean + apart]))
     shorter = before + torch.tensor([0.0, 1.0, 0.0]) * torch.tensor(0.6).log()
-    torch.testing.assert_close(method.scales[[3, 10]], shorter.expand(2, 3))
-    steps = optimizer.state[method.means]["steps"]
+    torch.testing.assert_close(method.gaussians.scales[[3, 10]], shorter.expand(2, 3))
+    steps = optimizer.state[method.gaussians.means]["steps"]
     assert steps.tolist() == [1.0] * 10 + [0.0]  # the new half begins afresh
-    assert len(method.unseen_rounds) == 11
-    assert not bool(method.gradient_sum.any())
+    assert len(method.density.unseen_rounds) == 11
+    assert not bool(method.density.gradient_sum.any())
     take_rows(method, optimizer, torch.arange(100) % 11)
-    method.gradient_sum.copy_(torch.arange(100.0))
-    renew(method, 1000, optimizer)
-    assert len(method.means) == 111  # at most a tenth and one are split at once
+    method.density.gradient_sum.copy_(torch.arange(100.0))
+    to_count(method, 1000, optimizer)
+    assert len(method.gaussians.means) == 111  # at most a tenth and one are split at once
 
 
 def test_what_has_faded_is_too_large_or_stood_too_near_to_a_camera_goes():
     method, optimizer = few()
-    method.opacity.data[2], method.scales.data[7, 0] = -5.0, 2.0
-    kept = method.means[SOME].clone()
-    renew(method, 8, optimizer)
-    torch.testing.assert_close(method.means.data, kept)
-    method.image_count.fill_(1)
-    method.unseen_rounds[1] = math.inf
-    method.gradient_sum[1], method.gradient_sum[2] = 9.0, 1.0  # it is not split, though it is pulled most
-    renew(method, 8, optimizer)
-    torch.testing.assert_close(method.means[:7].data, kept[[0, 2, 3, 4, 5, 6, 7]], atol=0.05, rtol=0)
-    assert (len(method.means), bool(method.unseen_rounds.any())) == (8, False)
-    method.opacity.data.fill_(-9.0)
-    renew(method, 10, optimizer)
-    assert len(method.means) == 8  # all that there is does not vanish
+    method.gaussians.opacity.data[2], method.gaussians.scales.data[7, 0] = -5.0, 2.0
+    kept = method.gaussians.means[SOME].clone()
+    to_count(method, 8, optimizer)
+    torch.testing.assert_close(method.gaussians.means.data, kept)
+    method.density.image_count.fill_(1)
+    method.density.unseen_rounds[1] = math.inf
+    method.density.gradient_sum[1], method.density.gradient_sum[2] = (
+        9.0,
+        1.0,
+    )  # it is not split, though it is pulled most
+    to_count(method, 8, optimizer)
+    torch.testing.assert_close(
+        method.gaussians.means[:7].data, kept[[0, 2, 3, 4, 5, 6, 7]], atol=0.05, rtol=0
+    )
+    assert (len(method.gaussians.means), bool(method.density.unseen_rounds.any())) == (8, False)
+    method.gaussians.opacity.data.fill_(-9.0)
+    to_count(method, 10, optimizer)
+    assert len(method.gaussians.means) == 8  # all that there is does not vanish
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("last", "left"), [(1.0, 9), (0.5, 10)])
 def test_what_is_never_seen_goes_after_some_rounds_once_all_times_are_in_play(last, left):
     method, optimizer = few(motion="spline")
-    method.nodes.seen_times.copy_(torch.tensor([0.0, last]))
+    method.deformation.nodes.seen_times.copy_(torch.tensor([0.0, last]))
     for _ in range(5):
-        method.image_count.fill_(1)
-        method.image_count[6] = 0
-        renew(method, 10, optimizer)
-    assert len(method.means) == left
+        method.density.image_count.fill_(1)
+        method.density.image_count[6] = 0
+        to_count(method, 10, optimizer)
+    assert len(method.gaussians.means) == left
 
 
 def test_few_that_stand_before_all_others_are_too_near_and_many_are_not():
@@ -98,19 +113,21 @@ def test_few_that_stand_before_all_others_are_too_near_and_many_are_not():
 
 def test_opacity_counts_where_it_is_largest_and_is_bounded_there():
     method, optimizer = few(opacity_over_time=3)
-    logits = method.opacity.data
+    logits = method.gaussians.opacity.data
     logits[:5, 0] = torch.tensor([20.0, 5.0, -8.0, 6.0, 7.0])
-    method.opacity_over_time.data.zero_()
-    method.opacity_over_time.data[1:3, 0] = -9.0  # the first cosine falls from 0 to -2
-    method.opacity_over_time.data[3, 0] = 2.0
+    method.gaussians.opacity_over_time.data.zero_()
+    method.gaussians.opacity_over_time.data[1:3, 0] = -9.0  # the first cosine falls from 0 to -2
+    method.gaussians.opacity_over_time.data[3, 0] = 2.0
     method.advance(0.999, 0, optimizer)
     assert logits[:6, 0].tolist() == pytest.approx([6.0, -12.0, -12.0, 6.0, 6.0, 0.0])
-    bases = torch.stack([method.time_bases(i / 64)[1] for i in range(65)])
-    assert float((method.gaussians().opacity.detach() @ bases.T).amax()) == pytest.approx(6.0, abs=1e-4)
+    bases = torch.stack([method.gaussians.time_bases(i / 64)[1] for i in range(65)])
+    assert float((method.gaussians.joined().opacity.detach() @ bases.T).amax()) == pytest.approx(
+        6.0, abs=1e-4
+    )
     logits.fill_(-20.0)
-    method.opacity_over_time.data.zero_()[:3, 0] = -15.0
-    renew(method, 3, optimizer)
-    assert len(method.means) == 3  # what appears later is not thrown away
+    method.gaussians.opacity_over_time.data.zero_()[:3, 0] = -15.0
+    to_count(method, 3, optimizer)
+    assert len(method.gaussians.means) == 3  # what appears later is not thrown away
 
 
 @pytest.mark.slow
@@ -120,27 +137,27 @@ def test_a_step_takes_opacity_of_what_its_image_shows_and_hides_as_the_rate_fall
     module = module_with(DATA, numbers=numbers)
     method, optimizer = module.method, module.configure_optimizers()
     (group,) = (group for group in optimizer.param_groups if group["name"] == "opacity")
-    method.means.data[:3] = 90.0  # beside every image
-    method.opacity.data[:, 0] = torch.linspace(-8, 6, len(method.opacity))
+    method.gaussians.means.data[:3] = 90.0  # beside every image
+    method.gaussians.opacity.data[:, 0] = torch.linspace(-8, 6, len(method.gaussians.opacity))
     for factor in (1.0, 0.25, 0.0):
         group["lr"] = factor * group["base_lr"]
-        method.opacity.grad, before = None, method.opacity.data.clone()
+        method.gaussians.opacity.grad, before = None, method.gaussians.opacity.data.clone()
         method.advance(0.5, 0, optimizer)
         look(module, DATA)
         optimizer.step()  # without gradients, as of a step that is dropped
-        assert torch.equal(method.opacity.data, before)
-        method.image_count.zero_()
+        assert torch.equal(method.gaussians.opacity.data, before)
+        method.density.image_count.zero_()
         look(module, DATA)
-        method.opacity.grad = torch.zeros_like(method.opacity)
+        method.gaussians.opacity.grad = torch.zeros_like(method.gaussians.opacity)
         optimizer.step()
-        shown = method.image_count[:, None] > 0
+        shown = method.density.image_count[:, None] > 0
         expected = torch.where(shown, 1 - factor * share, 1 - factor * hidden).double()
-        assert 0 < int(method.image_count.sum()) < len(expected) - 3
-        left = method.opacity.data.double().sigmoid() / before.double().sigmoid()
+        assert 0 < int(method.density.image_count.sum()) < len(expected) - 3
+        left = method.gaussians.opacity.data.double().sigmoid() / before.double().sigmoid()
         torch.testing.assert_close(left, expected, rtol=1e-5, atol=0)
     group["base_lr"] = group["lr"] = 0.0  # what does not learn does not decay
     method.advance(0.5, 0, optimizer)
-    assert method.decay == method.hidden_decay == 0
+    assert method.density.decay == method.density.hidden_decay == 0
 
 
 @pytest.fixture
@@ -148,7 +165,7 @@ def half():
     """Particles whose nodes on one side of the scene move, while all others stand aside, turned."""
     numbers = {"rest_from": 0.1, "relink": 1, "density_interval": 0.1}
     module = module_with(DATA, **EVERY | {"background": 0.01}, numbers=numbers)
-    nodes = module.method.nodes
+    nodes = module.method.deformation.nodes
     nodes.seen_times.copy_(torch.tensor([0.0, 1.0]))
     nodes.translations.data.fill_(0.05)
     nodes.rotations.data[..., 2] = 0.02
@@ -158,19 +175,21 @@ def half():
 
 
 def placed(method, time):
-    means, linear = moved(method.means.data, method.warp(time))
-    return means.detach(), linear.detach() @ rotations(method.quaternions.data)
+    means, linear = moved(method.gaussians.means.data, method.warp(time))
+    return means.detach(), linear.detach() @ rotations(method.gaussians.quaternions.data)
 
 
 def test_what_does_not_move_rests_where_it_was_and_as_it_was_turned(half):
     method, moves = half[0].method, half[1]
-    follows, (before, turned) = method.skinning.weights() > 1e-3, placed(method, 0.5)
-    come_to_rest(method, 0.01)
-    rests = method.resting
-    assert torch.equal(method.nodes.stopped, ~moves)
+    follows, (before, turned) = method.deformation.skinning.weights() > 1e-3, placed(method, 0.5)
+    freeze(method, 0.01)
+    rests = method.deformation.resting
+    assert torch.equal(method.deformation.nodes.stopped, ~moves)
     assert 0 < int(rests.sum()) < len(rests)
-    assert torch.equal(rests, (method.nodes.stopped[method.skinning.links.long()] | ~follows).all(-1))
-    assert torch.equal(rests, (method.skinning.shares == 0).all(-1))
+    assert torch.equal(
+        rests, (method.deformation.nodes.stopped[method.deformation.skinning.links.long()] | ~follows).all(-1)
+    )
+    assert torch.equal(rests, (method.deformation.skinning.shares == 0).all(-1))
     after, linear = placed(method, 0.5)
     torch.testing.assert_close(after[rests], before[rests], atol=1e-4, rtol=0)
     torch.testing.assert_close(linear[rests], turned[rests], atol=1e-3, rtol=0)
@@ -182,35 +201,35 @@ def test_what_does_not_move_rests_where_it_was_and_as_it_was_turned(half):
 def test_what_rests_keeps_resting_through_steps_and_density_control(half):
     module, moves = half
     method, optimizer = module.method, module.configure_optimizers()
-    come_to_rest(method, 0.01)
-    kept = method.nodes.translations.data[~moves].clone()
+    freeze(method, 0.01)
+    kept = method.deformation.nodes.translations.data[~moves].clone()
     for number in range(1, 4):
         step = look(module, DATA)
         for name, p in method.named_parameters():
             p.grad = step.gradients[name]
         optimizer.step()
         method.advance(0.1 * number + 0.05, number, optimizer)
-    assert torch.equal(method.nodes.translations.data[~moves], kept)
-    assert len(method.resting) == len(method.means)
-    assert int(method.skinning.shares[method.resting].count_nonzero()) == 0
-    assert bool(method.resting.any())
+    assert torch.equal(method.deformation.nodes.translations.data[~moves], kept)
+    assert len(method.deformation.resting) == len(method.gaussians.means)
+    assert int(method.deformation.skinning.shares[method.deformation.resting].count_nonzero()) == 0
+    assert bool(method.deformation.resting.any())
 
 
 def test_what_is_beyond_the_box_rests_without_a_node_and_may_be_large():
     module = module_with(data_of(replace(DATA.scene, has_alpha=False)), numbers={"shell": 4.0})
     method, optimizer = module.method, module.configure_optimizers()
-    beyond = method.beyond(method.means.data)
+    beyond = method.beyond(method.gaussians.means.data)
     assert 0 < int(beyond.sum()) < len(beyond)
-    assert torch.equal(method.resting, beyond)
-    assert not bool(method.beyond(method.nodes.positions).any())
-    method.scales.data[beyond] = math.log(0.5 * float(method.extent))
+    assert torch.equal(method.deformation.resting, beyond)
+    assert not bool(method.beyond(method.deformation.nodes.positions).any())
+    method.gaussians.scales.data[beyond] = math.log(0.5 * float(method.extent))
     for number in range(1, 4):
-        method.gradient_sum.copy_(method.beyond(method.means.data).float() + 1.0)
-        method.image_count.fill_(1.0)
+        method.density.gradient_sum.copy_(method.beyond(method.gaussians.means.data).float() + 1.0)
+        method.density.image_count.fill_(1.0)
         method.advance(0.1 * number, number, optimizer)
-    assert bool(method.resting[method.beyond(method.means.data)].all())
-    assert int(method.resting.sum()) > int(beyond.sum())  # split, not removed
-    assert int(method.skinning.shares[method.resting].count_nonzero()) == 0
+    assert bool(method.deformation.resting[method.beyond(method.gaussians.means.data)].all())
+    assert int(method.deformation.resting.sum()) > int(beyond.sum())  # split, not removed
+    assert int(method.deformation.skinning.shares[method.deformation.resting].count_nonzero()) == 0
 
 
 @pytest.mark.slow
@@ -223,17 +242,17 @@ def test_what_masks_say_rests_in_a_film_follows_no_node():
     for masks in ({"load_moving": lambda: moves}, {"load_resting": lambda: rests}):
         scene = replace(DATA.scene, train=tuple(replace(frame, **masks) for frame in DATA.scene.train))
         data = data_of(scene)
-        assert module_with(data).method.resting is None
+        assert module_with(data).method.deformation.resting is None
         method = module_with(data, numbers={"rest_by_masks": True}).method
         assert not switched(method)["background"]
         grown = dilate(moves if "load_moving" in masks else ~rests)
-        moving, seen = sightings(method.means.data, cameras, [grown] * len(cameras))
+        moving, seen = sightings(method.gaussians.means.data, cameras, [grown] * len(cameras))
         assert 0 < int((moving == 0).sum()) < len(seen)
-        assert bool(method.resting[moving == 0].all())
-        assert not bool(method.resting[(moving == seen) & (seen == len(cameras))].any())
-        assert int(method.skinning.shares[method.resting].count_nonzero()) == 0
+        assert bool(method.deformation.resting[moving == 0].all())
+        assert not bool(method.deformation.resting[(moving == seen) & (seen == len(cameras))].any())
+        assert int(method.deformation.skinning.shares[method.deformation.resting].count_nonzero()) == 0
     unknown = module_with(data_of(DATA.scene), numbers={"rest_by_masks": True}).method
-    assert not bool(unknown.resting.any())
+    assert not bool(unknown.deformation.resting.any())
 
 
 def test_what_rests_is_told_by_images_in_which_it_is_surface_and_around_the_canonical_time():
@@ -263,7 +282,7 @@ def test_what_moves_no_farther_than_a_pixel_from_its_mean_position_may_rest(
     half, monkeypatch, covered, least
 ):
     asked = []
-    monkeypatch.setattr(density, "come_to_rest", lambda _, least: asked.append(least))
+    monkeypatch.setattr(Deformation, "freeze_static_nodes", lambda *given: asked.append(given[3]))
     method, optimizer = half[0].method, half[0].configure_optimizers()
     method.covered_pixels.fill_(covered)
     method.extent.fill_(2.0)

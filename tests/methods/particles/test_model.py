@@ -1,5 +1,6 @@
 """A step of particles, their effects and rates, on every device and without kernels."""
 
+import re
 from dataclasses import replace
 
 import pytest
@@ -11,6 +12,7 @@ from forewarp.methods.method import Start
 from forewarp.methods.particles import model
 from forewarp.methods.particles.model import Particles
 from forewarp.scene.view import Moment, View
+from forewarp.training.checkpoints import misfits
 from forewarp.training.objective import set_gradients
 from tests.contract.fitting import Losses, run_of, stage_of
 from tests.contract.table import METHODS
@@ -29,9 +31,9 @@ def test_gradients_are_those_of_autograd(options):
     module = module_with(DATA, numbers={"jitter": 0.0}, **options)
     method, generator = module.method, torch.Generator().manual_seed(0)
     for name, p in method.named_parameters():
-        if name != "means":  # round particles have no rotation
+        if name != "gaussians.means":  # round particles have no rotation
             p.data += 0.1 * torch.randn(p.shape, generator=generator)
-    method.nodes.seen_times.copy_(torch.tensor([0.0, 1.0]))
+    method.deformation.nodes.seen_times.copy_(torch.tensor([0.0, 1.0]))
     step = look(module, DATA, 3, {"photo": 1.0})
     seen = next(iter(DATA.train_dataloader())).observations[0]
     drawn = method.at(seen.moment).render(View(seen.view.camera), seen.background)
@@ -57,7 +59,7 @@ def test_pixels_that_do_not_count_change_nothing(factors, scale, monkeypatch):
     valid = torch.zeros(seen.view.shape, dtype=torch.bool)
     valid[: len(valid) // 2] = True
     module = module_with(DATA, numbers={"jitter": 0.0, "image_scale": [[0, scale]]})
-    shaken(module).method.nodes.seen_times.copy_(torch.tensor([0.0, 1.0]))
+    shaken(module).method.deformation.nodes.seen_times.copy_(torch.tensor([0.0, 1.0]))
     for add in (0, 99):
         rgb = seen.rgb + (~valid.flatten())[:, None].byte() * add
         masked = replace(batch, observations=(replace(seen, rgb=rgb, valid=valid.flatten()),))
@@ -74,10 +76,23 @@ def test_pixels_that_do_not_count_change_nothing(factors, scale, monkeypatch):
     assert float(steps[0].squared_error) == pytest.approx(float(error.detach()), rel=1e-3)
 
 
+def test_a_checkpoint_of_earlier_names_loads_and_renders_the_same():
+    """Its names had no parts: ``means``, ``nodes.positions``, ``round``."""
+    module, fresh = shaken(module_with(DATA, **EVERY)), module_with(DATA, **EVERY)
+    state = {f"method.{name}": value for name, value in module.method.state_dict().items()}
+    earlier = {re.sub(r"\.(gaussians|density|deformation)\.", ".", name): v for name, v in state.items()}
+    assert not earlier.keys() & {name for name in state if name.count(".") > 1 and "exposure" not in name}
+    assert misfits(fresh, fresh.method.current_names(earlier, "method.")) == []
+    fresh.load_state_dict(earlier)
+    view, black = View(DATA.scene.train[0].camera), torch.zeros(3)
+    images = [made.method.at(Moment(0.3)).render(view, black).rgb for made in (module, fresh)]
+    assert torch.equal(*images)
+
+
 def test_image_losses_are_weighted_with_the_photo_term():
     """Their gradients are those of the photo term, by its kernel, and of each loss by itself."""
     module, steps = module_with(DATA, numbers={"jitter": 0.0}), []
-    shaken(module).method.nodes.seen_times.copy_(torch.tensor([0.0, 1.0]))
+    shaken(module).method.deformation.nodes.seen_times.copy_(torch.tensor([0.0, 1.0]))
     for factors in ({"photo": 1.0}, {"dssim": 1.0}, {"photo": 2.0, "dssim": 0.5}):
         steps.append(look(module, DATA, 3, factors))
     assert all(step.terms.pop("depth")() is None for step in steps)
@@ -134,7 +149,7 @@ def with_depth(data, shown=slice(None)):
 def test_depth_is_a_term_that_weighs_as_it_says(beside):
     data = with_depth(DATA)
     module = module_with(data, numbers={"jitter": 0.0}, weights={"photo": 1.0, "depth": 1.0})
-    shaken(module).method.nodes.seen_times.copy_(torch.tensor([0.0, 1.0]))
+    shaken(module).method.deformation.nodes.seen_times.copy_(torch.tensor([0.0, 1.0]))
     data.asks, steps = module.method.asks, []
     for factors in ({"photo": 1.0}, {"photo": 1.0, "depth": 1.0}, {"photo": 2.0, "depth": 0.5}):
         steps.append(look(module, data, 3, factors | beside))
@@ -167,7 +182,9 @@ def test_two_views_of_a_time_count_as_one_step():
     twice = type(batch)(batch.observations * 2, batch.frame)
     one, two = (module.method.look(b, {"photo": 1.0}, module.generator) for b in (batch, twice))
     assert float(one.terms["photo"]()) == pytest.approx(float(two.terms["photo"]()), rel=1e-5)
-    torch.testing.assert_close(one.gradients["means"], two.gradients["means"], rtol=1e-3, atol=1e-6)
+    torch.testing.assert_close(
+        *(step.gradients["gaussians.means"] for step in (one, two)), rtol=1e-3, atol=1e-6
+    )
 
 
 @pytest.mark.slow
@@ -182,8 +199,8 @@ def test_an_effect_that_is_off_is_absent_and_the_others_are_there(effect):
         assert all(step.terms[name]() is None for name in ("rigid", "smooth", "static"))
     if effect is None:
         names = {"means", "scales", "quaternions", "opacity", "colors"}
-        assert set(dict(module.method.named_parameters())) == set(module.method.param_groups()) == names
-        assert not any(name.startswith(("skinning.", "nodes.")) for name in module.method.state_dict())
+        assert set(module.method.values()) == set(module.method.param_groups()) == names
+        assert not any(name.startswith("deformation.") for name in module.method.state_dict())
 
 
 @pytest.mark.slow
@@ -218,21 +235,27 @@ def test_what_stands_right_before_a_camera_is_to_go():
     module = module_with(DATA)
     method, camera = module.method, DATA.scene.train[0].camera
     ahead = camera.rays(torch.tensor([camera.height // 2 * camera.width + camera.width // 2])).directions[0]
-    method.means.data[5] = camera.center + 0.1 * ahead * (method.means.data[5] - camera.center).norm()
+    method.gaussians.means.data[5] = (
+        camera.center + 0.1 * ahead * (method.gaussians.means.data[5] - camera.center).norm()
+    )
     look(module, DATA, 0)
-    assert method.unseen_rounds.isinf().nonzero().flatten().tolist() == [5]
+    assert method.density.unseen_rounds.isinf().nonzero().flatten().tolist() == [5]
 
 
 def test_particles_grow_to_what_the_images_call_for():
     numbers = {"density_interval": 0.1, "initial_share": 0.5, "density_until": 1.0, "density": 400.0}
     module = module_with(DATA, numbers=numbers)
     method, optimizer = module.method, module.configure_optimizers()
-    assert len(method.means) == round(0.5 * float(method.final_count))
+    assert len(method.gaussians.means) == round(0.5 * float(method.final_count))
     for number in range(1, 10):
         look(module, DATA)
         method.advance(number / 10, number, optimizer)
-    assert len(method.means) == pytest.approx(float(method.final_count), rel=0.05)
-    assert len(method.skinning.links) == len(method.gradient_sum) == len(method.means)
+    assert len(method.gaussians.means) == pytest.approx(float(method.final_count), rel=0.05)
+    assert (
+        len(method.deformation.skinning.links)
+        == len(method.density.gradient_sum)
+        == len(method.gaussians.means)
+    )
     start = Start(DATA.scene, "fine", {"density": 800.0}, range(3), before=method)
     assert int(Particles(start).final_count) == pytest.approx(2 * int(method.final_count), abs=1)
 
@@ -246,7 +269,7 @@ def test_a_stage_and_its_queries_stay_on_their_device():
         method, camera = module.method.to("cuda"), DATA.scene.train[0].camera
         optimizer = module.configure_optimizers()
         method.warm_up()
-        begun = len(method.means)
+        begun = len(method.gaussians.means)
         for number in range(1, 6):
             method.advance(number / 10, number, optimizer)
             DATA.picker = lambda number=number: number
@@ -255,8 +278,8 @@ def test_a_stage_and_its_queries_stay_on_their_device():
             set_gradients(method, step.gradients)  # which refuses those of another device
             optimizer.step()
         assert {t.device for t in method.state_dict().values()} == {GPU}
-        assert len(method.means) > begun
-        assert method.resting.any()
+        assert len(method.gaussians.means) > begun
+        assert method.deformation.resting.any()
         snapshot = method.at(Moment(0.6, 2, 0))
         assert (snapshot.holds(Moment(0.6)), snapshot.holds(Moment(0.61))) == (True, False)
         for view in (View(camera), View(camera, torch.tensor([3, 4])), View(camera, crop=(1, 1, 4, 4))):

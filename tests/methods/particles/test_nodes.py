@@ -63,9 +63,9 @@ def test_gradients_of_curves_are_those_of_autograd(kind, straight, rotates):
     smooth = sum(bend.square().mean() for bend in bends)
     ((motion * by_motion).sum() + 3.0 * smooth).backward()
     assert bent == pytest.approx(float(smooth.detach()), rel=1e-4)
-    assert found.keys() == {f"nodes.{name}" for name, _ in nodes.named_parameters()}
+    assert found.keys() == {name for name, _ in nodes.named_parameters()}
     for name, parameter in nodes.named_parameters():
-        torch.testing.assert_close(found[f"nodes.{name}"], parameter.grad, atol=1e-5, rtol=1e-3)
+        torch.testing.assert_close(found[name], parameter.grad, atol=1e-5, rtol=1e-3)
 
 
 @pytest.mark.parametrize(("kind", "rotates"), [("spline", True), ("spline", False), ("cosines", True)])
@@ -144,7 +144,7 @@ def test_times_are_off_by_what_was_learned_and_no_more():
     ],
 )
 def test_times_of_splines_are_corrected_unless_they_are_few(options, times, learned):
-    nodes = module_with(small_data(times), **options).method.nodes
+    nodes = module_with(small_data(times), **options).method.deformation.nodes
     assert (nodes.time_offsets is not None) == ("time_offsets" in nodes.param_groups()) == learned
 
 
@@ -170,7 +170,7 @@ def test_gradients_by_the_offsets_are_finite_differences(rotates, time):
     def loss() -> float:
         return float((nodes.motion_and_maps(nodes.basis(time))[0] * by_motion).sum())
 
-    found = gradients()["nodes.time_offsets.values"]
+    found = gradients()["time_offsets.values"]
     for row in range(5):
         sides = []
         for step in (1e-2, -2e-2):
@@ -179,7 +179,7 @@ def test_gradients_by_the_offsets_are_finite_differences(rotates, time):
         offsets.values.data[row] += 1e-2
         assert float(found[row]) == pytest.approx((sides[0] - sides[1]) / 2e-2, rel=2e-2, abs=1e-5)
     offsets.learns = False
-    assert "nodes.time_offsets.values" not in gradients()
+    assert "time_offsets.values" not in gradients()
 
 
 @pytest.mark.slow
@@ -196,7 +196,7 @@ def test_a_first_image_that_shows_the_second_time_is_understood():
         error[:, :3] -= speed * max(times[1], time)
         error[:, 2] = 0  # along the line of sight
         found = nodes.backward(time, motion_time, nodes.basis(time), error, 0.0, 1.0)[1]
-        offsets.values.grad = found["nodes.time_offsets.values"]
+        offsets.values.grad = found["time_offsets.values"]
         adam.step()
         offsets.settle(adam.param_groups[0]["lr"])
         adam.param_groups[0]["lr"] *= 0.998

@@ -40,11 +40,13 @@ def test_ellipsoids_are_seen_as_the_particles_are(options, time, by):
 @pytest.mark.parametrize("motion", ["spline", "cosines"])
 def test_points_go_with_the_particles_beside_them(motion):
     method, generator = module_with(DATA, motion=motion).method, torch.Generator().manual_seed(0)
-    for p in method.nodes.parameters():
+    for p in method.deformation.nodes.parameters():
         p.data += 0.05 * torch.randn(p.shape, generator=generator)
-    method.skinning.logits.data += torch.randn(method.skinning.logits.shape, generator=generator)
+    method.deformation.skinning.logits.data += torch.randn(
+        method.deformation.skinning.logits.shape, generator=generator
+    )
     times = torch.tensor([method.canonical_time, 0.7])
-    place, later = (moved(method.means.data, method.warp(float(time)))[0] for time in times)
+    place, later = (moved(method.gaussians.means.data, method.warp(float(time)))[0] for time in times)
     paths = method.trajectories(place[:20], times)
     torch.testing.assert_close(paths[:, 0], place[:20])
     torch.testing.assert_close(paths[:, 1], later[:20], atol=2e-3, rtol=0)  # others are near, too
@@ -56,11 +58,15 @@ def test_points_go_with_the_particles_beside_them(motion):
 def test_what_a_pixel_shows_goes_with_the_particles_that_show_it():
     method, generator = module_with(DATA).method, torch.Generator().manual_seed(0)
     assert isinstance(method, CarriesPixels)
-    method.nodes.translations.data += 0.05 * torch.randn(method.nodes.translations.shape, generator=generator)
+    method.deformation.nodes.translations.data += 0.05 * torch.randn(
+        method.deformation.nodes.translations.shape, generator=generator
+    )
     alone = method.only(torch.tensor([7]))
-    alone.opacity.data.fill_(9.0)
+    alone.gaussians.opacity.data.fill_(9.0)
     first, later = Moment(0.2), Moment(0.7)
-    before, after = (moved(alone.means, alone.warp(moment.time))[0].detach() for moment in (first, later))
+    before, after = (
+        moved(alone.gaussians.means.data, alone.warp(m.time))[0].detach() for m in (first, later)
+    )
     camera = DATA.scene.train[0].camera
     column, row = camera.project(before)[0][0].floor().long().tolist()
     view = View(camera, torch.tensor([row * camera.width + column, 0]))
@@ -74,24 +80,28 @@ def test_where_there_is_nothing_to_see_there_are_no_bounds_and_all_particles_are
     method = module_with(DATA).method
     box = method.bounds([0.0, 1.0])
     assert all(low < high for low, high in zip(box.low, box.high))
-    method.opacity.data.fill_(-9.0)
+    method.gaussians.opacity.data.fill_(-9.0)
     assert method.bounds([0.0, 1.0]) is None
-    assert len(method.matter()) == len(method.means)
+    assert len(method.matter()) == len(method.gaussians.means)
 
 
 def pulled(pixels, where=lambda points: points[:, 0] > 0):
     """Particles of which one side goes to and fro along y, ``pixels`` from its mean place at most."""
     method = module_with(DATA, **EVERY).method
     camera = DATA.scene.train[0].camera
-    reach = pixels * float((camera.center - method.means.data.mean(0)).norm()) / camera.fx
-    moves = where(method.nodes.positions)
-    method.nodes.translations.data[moves, :, 1] = reach * torch.linspace(-1, 1, method.nodes.curve.count)
-    method.skinning.links = method.skinning.links[:, :1].contiguous()  # each follows one node alone
+    reach = pixels * float((camera.center - method.gaussians.means.data.mean(0)).norm()) / camera.fx
+    moves = where(method.deformation.nodes.positions)
+    method.deformation.nodes.translations.data[moves, :, 1] = reach * torch.linspace(
+        -1, 1, method.deformation.nodes.curve.count
+    )
+    method.deformation.skinning.links = method.deformation.skinning.links[
+        :, :1
+    ].contiguous()  # each follows one node alone
     for name in ("shares", "logits"):
-        rows = getattr(method.skinning, name).data[:, :1]
+        rows = getattr(method.deformation.skinning, name).data[:, :1]
         part = torch.ones_like(rows) if name == "shares" else torch.zeros_like(rows)
-        setattr(method.skinning, name, part if name == "shares" else torch.nn.Parameter(part))
-    return method, moves[method.skinning.links[:, 0].long()]
+        setattr(method.deformation.skinning, name, part if name == "shares" else torch.nn.Parameter(part))
+    return method, moves[method.deformation.skinning.links[:, 0].long()]
 
 
 @pytest.mark.slow
@@ -101,7 +111,7 @@ def test_what_moves_is_seen_to_move_and_what_rests_is_not():
     found = method.in_motion(DATA.scene.train)
     assert 0.2 < float(moves.float().mean()) < 0.8
     assert float((found == moves).float().mean()) > 0.9  # but where the median has some of both
-    method.skinning.release(torch.arange(len(moves)) % 2 == 0)
+    method.deformation.skinning.release(torch.arange(len(moves)) % 2 == 0)
     assert not bool(method.in_motion(DATA.scene.train)[::2].any())
     for calm in (pulled(0.3)[0], module_with(DATA, motion=None).method):
         assert not bool(calm.in_motion(DATA.scene.train).any())
@@ -114,7 +124,7 @@ def test_motion_along_the_rays_of_all_cameras_is_none():
     pose[:3, 3] -= 200 * pose[:3, 2]  # so far away that its rays are parallel
     camera = replace(frame.camera, camera_to_world=pose, fx=50 * frame.camera.fx, fy=50 * frame.camera.fy)
     ahead = camera.camera_to_world[:3, 2].float()
-    translations = method.nodes.translations.data
+    translations = method.deformation.nodes.translations.data
     translations.copy_(translations[..., 1:2] * ahead)
     frames = [replace(frame, camera=camera, time=i / 9) for i in range(10)]
     assert not bool(method.in_motion(frames).any())
@@ -126,13 +136,13 @@ def test_motion_along_the_rays_of_all_cameras_is_none():
 
 def test_a_layer_is_some_of_the_particles_and_shares_of_layers_fill_the_picture():
     method = shaken(module_with(DATA, **EVERY)).method
-    rows, view = torch.arange(len(method.means)) % 3 == 1, View(DATA.scene.train[1].camera)
+    rows, view = torch.arange(len(method.gaussians.means)) % 3 == 1, View(DATA.scene.train[1].camera)
     part, whole = method.only(rows), method.at(Moment(0.4))
     for name in ("centers", "roots", "opacity", "harmonics"):
         found, wanted = (getattr(m.ellipsoids(0.4), name) for m in (part, method))
         torch.testing.assert_close(found, wanted[rows])
     assert part.size == ("particles", int(rows.sum()))
-    assert len(method.means) == len(rows)  # the method itself has all as before
+    assert len(method.gaussians.means) == len(rows)  # the method itself has all as before
     with torch.no_grad():
         shares = [whole.share(view, which) for which in (rows, ~rows)]
         alone = part.at(Moment(0.4)).render(view, torch.zeros(3)).opacity

@@ -8,7 +8,7 @@ What flies is set on what lies below it in the image, and what something hides b
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Callable
 
 import torch
 from torch import Tensor
@@ -17,10 +17,7 @@ from forewarp.methods.particles.start import SMALL_MOVERS, first_values
 from forewarp.ops.grid import dilate
 from forewarp.scene.cloud import Cloud
 from forewarp.scene.frame import Frame, Scene, where_seen
-from forewarp.scene.view import Moment, Rendering, View
-
-if TYPE_CHECKING:
-    from forewarp.methods.particles.model import Particles
+from forewarp.scene.view import Rendering
 
 # Share of an image's pixels, below which a patch of a mask is no thing.
 _SMALLEST = 1e-3
@@ -36,18 +33,25 @@ _SEEN = 0.5  # opacity from which on the ground is known
 
 
 @torch.no_grad()
-def set_down(values: dict[str, Tensor], before: Particles, scene: Scene) -> dict[str, Tensor]:
+def place_on_ground(
+    values: dict[str, Tensor],
+    scene: Scene,
+    draw: Callable[[Frame], Rendering],
+    light_of: Callable[[Frame], Tensor | None],
+) -> dict[str, Tensor]:
     """Put what the canonical image's mask says moves at the distance of the ground that it stands on.
 
     What has no ground in sight, as it (nearly) reaches the lower edge of the image, stays as it is.
 
     Args:
         values: of the N first particles, by name.
-        before: fitted at rest; it shows the ground.
         scene: of one camera, with masks of what moves and no measured depth; else nothing changes.
+        draw: renders the particles of the stage before, which were fitted at rest and show the ground, as an
+            image shows them, (H, W).
+        light_of: returns gain and bias (2, 3) of an image's colours; None: 1 and 0.
 
     Returns:
-        the values, without particles that stood in for these things, and with new ones last; ``set_down``,
+        the values, without particles that stood in for these things, and with new ones last; ``is_placed``,
         bool of each, says which are new, and ``body_of``, int64, which body each is of, -1: of none. Bodies
         are things of films whose movers are small: what fills an image, as a hand, is mostly not rigid. Where
         nothing changes, the values as they are.
@@ -55,13 +59,11 @@ def set_down(values: dict[str, Tensor], before: Particles, scene: Scene) -> dict
     Cost: an image is rendered.
     """
     frame = min(scene.train, key=lambda frame: abs(frame.time - scene.canonical_time))
-    if before.moves or frame.load_moving is None or frame.load_sensed is not None or not scene.has_one_camera:
+    if frame.load_moving is None or frame.load_sensed is not None or not scene.has_one_camera:
         return values
     camera, height = frame.camera, frame.camera.height
-    moment = Moment(frame.time, camera=frame.camera_id, filmed=True)
-    drawn = before.at(moment).render(View(camera), torch.zeros(3)).shaped(height, camera.width)
     means, moving = values["means"], frame.load_moving()
-    depth = known_depth(drawn)
+    depth = known_depth(draw(frame))
     if frame.load_valid is not None:
         depth[~frame.load_valid()] = 0.0
     step, edge = max(1, round(_STEP * height)), max(1, round(_EDGE * height))
@@ -81,7 +83,7 @@ def set_down(values: dict[str, Tensor], before: Particles, scene: Scene) -> dict
         return values
     if "shared" in values:
         gone &= values["shared"] < 0
-    fresh, kept = _pieces(frame, ground, bulge, step, before.light(moment)), {}
+    fresh, kept = _pieces(frame, ground, bulge, step, light_of(frame)), {}
     count = len(fresh["means"])
     for name, value in values.items():
         if name == "exposure":
@@ -93,7 +95,7 @@ def set_down(values: dict[str, Tensor], before: Particles, scene: Scene) -> dict
     if float(moving.float().mean()) > SMALL_MOVERS:
         of = torch.full_like(of, -1)
     kept["body_of"] = torch.cat([torch.full((len(kept["means"]) - count,), -1), of])
-    kept["set_down"] = torch.arange(len(kept["means"])) >= len(kept["means"]) - count
+    kept["is_placed"] = torch.arange(len(kept["means"])) >= len(kept["means"]) - count
     return kept
 
 

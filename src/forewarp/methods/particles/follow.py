@@ -12,21 +12,22 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple, Protocol
 
 import torch
 from torch import Tensor
 
+from forewarp.fields.moving import GaussiansSnapshot
 from forewarp.methods.particles.bodies import Bodies, Poses
 from forewarp.methods.particles.contact import known_depth, things_on_the_ground
-from forewarp.ops.gaussians import Gaussians, Warp, moved
+from forewarp.methods.particles.deformation import Deformation
+from forewarp.methods.particles.gaussians import GaussianModel
+from forewarp.methods.particles.options import Numbers
+from forewarp.ops.gaussians import Gaussians, ImageLoss, Warp, moved
 from forewarp.ops.grid import dilate
 from forewarp.scene.camera import Camera
 from forewarp.scene.frame import Frame, where_seen
-from forewarp.scene.view import Observation, View
-
-if TYPE_CHECKING:
-    from forewarp.methods.particles.model import Particles
+from forewarp.scene.view import Moment, Observation, View
 
 _SIDES = 100, 200, 400  # pixels of the longer side of an image as it is looked at
 _SLIDES, _FALL = 10, 0.1  # steps in the first: of a pixel, that fall to this share of it
@@ -45,6 +46,30 @@ _REACH, _FASTER = 0.05, 1.5
 _FARTHEST_OFF, _ALIKE = 0.25, 0.3  # of that side, how far at most; the least correlation
 _FARTHEST = 3.0  # times the way between the two nearest images that a body may have gone on from the first
 _CELL = 0.05  # of an image's longer side: what lies within about one of a body is looked at with it
+
+
+class _Particles(Protocol):
+    """What is asked of the particles whose bodies are followed; see ``model.Particles``."""
+
+    gaussians: GaussianModel
+    deformation: Deformation
+    frames: Mapping[float, Frame]
+    progress: float
+    stage: Numbers
+
+    def at(self, moment: Moment) -> GaussiansSnapshot:
+        """Freeze them at a moment."""
+
+    def light(self, moment: Moment) -> Tensor | None:
+        """Return the gain and the bias of the colours of an image."""
+
+    def warp(self, time: float) -> Warp:
+        """Return how they move from the canonical state to a time."""
+
+    def compared(
+        self, seen: Observation, particles: Gaussians, warp: Warp, time: float, factor: float
+    ) -> ImageLoss:
+        """Compare some of them, moved by a warp, with an image."""
 
 
 class Look(NamedTuple):
@@ -72,17 +97,16 @@ class Sight(NamedTuple):
 
 
 @torch.no_grad()
-def follow(particles: Particles, seen: Observation, frames: Mapping[float, Frame]) -> None:
+def follow(particles: _Particles, seen: Observation) -> None:
     """Look for where the bodies of particles are in an image; if that was done, fit their distances at times.
 
     Args:
         particles: whose bodies lead.
         seen: a whole training image.
-        frames: all training images, by time.
 
     Cost: about 80 comparisons of small images with what is near bodies; two images are loaded.
     """
-    nodes, time, camera = particles.nodes, seen.moment.time, seen.view.camera
+    nodes, time, camera = particles.deformation.nodes, seen.moment.time, seen.view.camera
     bodies = nodes.bodies
     row, number = bodies.row(time), int(_ROUNDS * particles.progress / particles.stage.bodies)
     known, late = bool(bodies.seen[row]), int(bodies.rounds[row]) < number
@@ -92,7 +116,7 @@ def follow(particles: Particles, seen: Observation, frames: Mapping[float, Frame
         if late:
             _refit(particles, seen)
         return
-    again = partial(_again, particles, frames, time)
+    again = partial(_again, particles, particles.frames, time)
     image = Sight(camera.center.to(nodes.positions), partial(_looks, particles, seen), again)
     found = find(bodies, time, nodes.positions, image)
     if not all(bool(part.isfinite().all()) for part in found):
@@ -100,24 +124,25 @@ def follow(particles: Particles, seen: Observation, frames: Mapping[float, Frame
     bodies.put(time, found, image.eye)
     if late:
         _refit(particles, seen)
-    load_moving = frames[time].load_moving
+    load_moving = particles.frames[time].load_moving
     moving = None if load_moving is None else load_moving()
     bodies.bring_before(time, _farthest(particles, seen, moving))
 
 
 @torch.no_grad()
-def put_on_ground(particles: Particles) -> None:
+def put_on_ground(particles: _Particles) -> None:
     """Make bodies as much larger and farther away as they can be before what rests below them: images tell
     how their distances compare, and little about how far away all of them are.
     """
-    nodes, bodies, of = particles.nodes, particles.nodes.bodies, _body_of(particles)
+    nodes, gaussians, of = particles.deformation.nodes, particles.gaussians, _body_of(particles)
+    bodies = nodes.bodies
     canonical = bodies.row(nodes.curve.canonical_time)
     eye = _frame_at(particles.frames, bodies.times[canonical]).camera.center.to(bodies.eyes)
     times, bodies.eyes[canonical] = bodies.nearest_to_ground(), eye
     bodies.enlarge(times, eye)
     own, by = of >= 0, bodies.of_node >= 0
-    particles.means[own] = eye + times[of[own], None] * (particles.means[own] - eye)
-    particles.scales[own] += times[of[own], None].log()
+    gaussians.means[own] = eye + times[of[own], None] * (gaussians.means[own] - eye)
+    gaussians.scales[own] += times[of[own], None].log()
     nodes.positions[by] = eye + times[bodies.of_node[by], None] * (nodes.positions[by] - eye)
     nodes.spacing[by] *= times[bodies.of_node[by]]
 
@@ -181,9 +206,10 @@ def fit_distances(poses: Poses, eye: Tensor, compared: Callable[[Poses], float])
     return poses
 
 
-def _refit(particles: Particles, seen: Observation) -> None:
+def _refit(particles: _Particles, seen: Observation) -> None:
     """Fit distances of bodies to an image in which they were found."""
-    bodies, positions, time = particles.nodes.bodies, particles.nodes.positions, seen.moment.time
+    nodes, time = particles.deformation.nodes, seen.moment.time
+    bodies, positions = nodes.bodies, nodes.positions
     poses, eye = bodies.at(time), seen.view.camera.center.to(positions)
     (look,) = _looks(particles, seen, _carried(bodies, poses, positions)[0], _SIDES[-1:])
 
@@ -263,14 +289,14 @@ def _fitted(
 
 
 def _looks(
-    particles: Particles, seen: Observation, places: Tensor, sides: Sequence[int] = _SIDES
+    particles: _Particles, seen: Observation, places: Tensor, sides: Sequence[int] = _SIDES
 ) -> list[Look]:
     """Return an image in some sizes, with the particles that are bodies' or near places (P, 3)."""
-    camera, moment, skinning = seen.view.camera, seen.moment, particles.skinning
-    means, _ = moved(particles.means, particles.warp(moment.time))
+    camera, moment, skinning = seen.view.camera, seen.moment, particles.deformation.skinning
+    means, _ = moved(particles.gaussians.means, particles.warp(moment.time))
     near = near_places(camera, means, places)
     near |= _body_of(particles) >= 0
-    part = Gaussians(*(values[near] for values in particles.gaussians(particles.light(moment))))
+    part = Gaussians(*(values[near] for values in particles.gaussians.joined(particles.light(moment))))
     links, weights, looks = skinning.links[near], skinning.weights()[near], []
     for side in sides:
         small = seen.smaller(max(1.0, max(camera.width, camera.height) / side))
@@ -295,12 +321,14 @@ def near_places(camera: Camera, points: Tensor, places: Tensor) -> Tensor:
     return seen & near[row.clamp(0, camera.height - 1) // cell, column.clamp(0, camera.width - 1) // cell]
 
 
-def _again(particles: Particles, frames: Mapping[float, Frame], time: float, row: int, going: Poses) -> Poses:
+def _again(
+    particles: _Particles, frames: Mapping[float, Frame], time: float, row: int, going: Poses
+) -> Poses:
     """Look in the image of a time for what that of a row shows of bodies, around where they then were; the
     farther around, the farther they would be if they went on. Return poses turned as they would be, as far
     from the new eye as they were; what is not found stays where it was.
     """
-    bodies = particles.nodes.bodies
+    bodies, gaussians = particles.deformation.nodes.bodies, particles.gaussians
     held = Poses(bodies.turns[:, row], bodies.middles[:, row])
     (image, camera), (other, after) = _small(_frame_at(frames, bodies.times[row])), _small(frames[time])
     of, eye, found = _body_of(particles), after.center.to(held.middles), Poses(going.turns, held.middles)
@@ -309,8 +337,8 @@ def _again(particles: Particles, frames: Mapping[float, Frame], time: float, row
         for view, middles in ((camera, held.middles), (after, held.middles), (after, going.middles))
     )
     for body in range(len(bodies)):
-        own = (of == body) & (particles.opacity[:, 0] > 0)
-        points = (particles.means[own] - bodies.rest[body]) @ held.turns[body].T + held.middles[body]
+        own = (of == body) & (gaussians.opacity[:, 0] > 0)
+        points = (gaussians.means[own] - bodies.rest[body]) @ held.turns[body].T + held.middles[body]
         rows, columns, seen = (part.cpu() for part in where_seen(camera, points))
         mask = torch.zeros(image.shape, dtype=torch.bool)
         mask[rows[seen], columns[seen]] = True
@@ -324,10 +352,10 @@ def _again(particles: Particles, frames: Mapping[float, Frame], time: float, row
     return found
 
 
-def _body_of(particles: Particles) -> Tensor:
+def _body_of(particles: _Particles) -> Tensor:
     """Return the body that each particle is of, (N,); -1: of none, or at rest."""
-    skinning = particles.skinning
-    of = particles.nodes.bodies.of_node[skinning.links[:, 0].long()]
+    skinning = particles.deformation.skinning
+    of = particles.deformation.nodes.bodies.of_node[skinning.links[:, 0].long()]
     return of.where(skinning.shares.sum(-1) > 0, -1)
 
 
@@ -386,12 +414,12 @@ def find_shift(image: Tensor, mask: Tensor, other: Tensor, around: Tensor, reach
     return around + torch.tensor([column - reach, row - reach])
 
 
-def _farthest(particles: Particles, seen: Observation, moving: Tensor | None) -> Tensor:
+def _farthest(particles: _Particles, seen: Observation, moving: Tensor | None) -> Tensor:
     """Return how far away middles of bodies may be in an image, (B,): as what rests is right below each, or
     below the patch of what moves (H, W) that it is alone in, whichever is farther: shadows move, too.
     """
-    camera, bodies, skinning = seen.view.camera, particles.nodes.bodies, particles.skinning
-    camera = _shrunk(camera)
+    bodies, skinning = particles.deformation.nodes.bodies, particles.deformation.skinning
+    camera = _shrunk(seen.view.camera)
     size = camera.height, camera.width
     whole = particles.at(seen.moment)
     rests = skinning.shares.sum(-1) == 0
@@ -399,7 +427,7 @@ def _farthest(particles: Particles, seen: Observation, moving: Tensor | None) ->
     part = replace(whole, gaussians=Gaussians(*(values[rests] for values in whole.gaussians)), warp=still)
     drawn = part.render(View(camera), torch.zeros(3, device=rests.device)).shaped(*size)
     depth = known_depth(drawn).cpu()
-    row, column, shown = where_seen(camera, moved(particles.means, whole.warp)[0])
+    row, column, shown = where_seen(camera, moved(particles.gaussians.means, whole.warp)[0])
     of = _body_of(particles)
     own = [shown & (of == body) for body in range(len(bodies))]
     masks = torch.zeros(len(bodies), *size, dtype=torch.bool)

@@ -12,24 +12,26 @@ import torch
 from torch import Tensor, nn
 
 from forewarp.fields.curves import Curve
-from forewarp.fields.moving import GaussiansSnapshot, MovingGaussians, NodeMotion, cosines, pinhole_of
+from forewarp.fields.moving import GaussiansSnapshot, MovingGaussians, NodeMotion, pinhole_of
 from forewarp.losses import IMAGE_LOSSES, robust
 from forewarp.methods.method import Method, Snapshot, Start, Step, value_at
-from forewarp.methods.particles import density, exposure
-from forewarp.methods.particles.contact import known_depth, set_down
+from forewarp.methods.particles import exposure
+from forewarp.methods.particles.contact import known_depth, place_on_ground
+from forewarp.methods.particles.deformation import Deformation, standing
+from forewarp.methods.particles.density import DensityControl
 from forewarp.methods.particles.follow import follow, put_on_ground
+from forewarp.methods.particles.gaussians import GaussianModel, coefficients
 from forewarp.methods.particles.nodes import Nodes, Skinning, TimeOffsets, are_rows
 from forewarp.methods.particles.options import EFFECTS, SMALLEST, Effects, Numbers, view_share
-from forewarp.methods.particles.shared import begin_window, check_still, left_alone
 from forewarp.methods.particles.start import at_rest, compile_kernels, first_values, fresh_values
-from forewarp.methods.rows import RowsAdam, keep_rows
+from forewarp.methods.particles.windows import begin_window, check_still
+from forewarp.methods.rows import RowsAdam, keep_rows, take_rows
 from forewarp.ops.gaussians import BLUR, CHUNK, DEEP, Gaussians, ImageLoss, Warp, compare, moved
-from forewarp.ops.nodes import pull_nodes
 from forewarp.scene.box import Box
 from forewarp.scene.camera import Camera
 from forewarp.scene.cloud import Cloud, Ellipsoids, nearest
 from forewarp.scene.frame import Frame, spread
-from forewarp.scene.view import Asks, Batch, Moment, Observation, View
+from forewarp.scene.view import Asks, Batch, Moment, Observation, Rendering, View
 
 _FEWEST_TIMES = 8  # of training, for learned corrections of them
 _KEPT = 2**28  # bytes of colours of smaller images that are kept
@@ -37,9 +39,6 @@ _SOLID = 0.1  # opacity from which matter bounds the scene
 _FRAMES, _CAMERAS = 32, 8  # at whose times, and from which of them, motion is looked at
 MOVES = 1.5  # pixels from the mean place, from which on it is seen that a particle moves
 _ALIKE = 9  # particles beside each other, whose median counts
-# Parameters and buffers with a row for each particle; those of effects that are off are None.
-_ROWS = ("means", "scales", "quaternions", "opacity", "colors", "sh", "color_over_time", "opacity_over_time")
-_ROWS += ("gradient_sum", "image_count", "unseen_rounds", "resting", "shared")
 
 
 @dataclass(eq=False, repr=False)
@@ -58,7 +57,12 @@ class Particles(Method):
     """N canonical Gaussians, and M nodes that carry them through time.
 
     A step renders a whole image, compares it, and has its gradients in one pass of ``ops.compare``; the
-    optimiser passes over particles that the image does not show.
+    optimiser passes over Gaussians that the image does not show.
+
+    Attributes:
+        gaussians: what is learned of each (``GaussianModel``).
+        deformation: how they move (``Deformation``); None: they do not.
+        density: when and where they are split and removed (``DensityControl``).
 
     Args:
         start: what it is built from; for the stage's numbers see ``options.Numbers``.
@@ -72,9 +76,14 @@ class Particles(Method):
     terms = ("photo", *IMAGE_LOSSES, "depth", "rigid", "smooth", "static")
     numbers = tuple(key for key in Numbers.__dataclass_fields__ if key != "name")
     asks = Asks(kind="pictures", straight=True)
-    loose = Skinning.ROWS  # a particle follows fewer nodes where there are few
+    loose = tuple(f"deformation.skinning.{name}" for name in Skinning.ROWS)  # few nodes: fewer links
     effects, still_steps = EFFECTS, 700  # a step is of one image
     on_cpu = "it has no GPU kernels"
+    earlier_names = (
+        *((name, f"gaussians.{name}") for name in GaussianModel.ROWS),
+        *((name, f"density.{name}") for name in (*DensityControl.ROWS, "round")),
+        *((name, f"deformation.{name}") for name in ("resting", "nodes.", "skinning.")),
+    )
 
     def __init__(
         self,
@@ -99,70 +108,69 @@ class Particles(Method):
         self.frames = {frame.time: frame for frame in train}
         effects = Effects(**choices).only(self.stage.effects, len(times))
         self.ends = min(times), max(times)
-        self.progress = self.decay = self.hidden_decay = 0.0
-        self.shown_now: list[Tensor] = []  # which particles each image of this step showed
+        self.progress = 0.0
         self.small_by, self.small = 1.0, {}  # images made so many times smaller, by frame
 
         self.box = start.scene.box if self.stage.shell and not start.scene.has_alpha else None
         values = self._first_values(start, effects.motion is not None and self.stage.rest_by_masks)
-        new, body_of = values.pop("set_down", None), values.pop("body_of", None)
-        count = len(values["means"])
-        self.means = nn.Parameter(values["means"])
-        self.scales = nn.Parameter(values["scales"])  # logarithms
-        self.quaternions = nn.Parameter(values["quaternions"])  # w, x, y, z of any length
-        self.opacity = nn.Parameter(values["opacity"])  # logits
-        self.colors = nn.Parameter(values["colors"])  # of the constant harmonic
-        degree = effects.view_dependence or 0
-        self.sh = _coefficients(values.get("sh"), count, degree * (degree + 2), 3)  # of the other harmonics
-        colors, opacities = effects.color_over_time or 0, effects.opacity_over_time or 0
-        self.color_over_time = _coefficients(values.get("color_over_time"), count, colors, 3)
-        self.opacity_over_time = _coefficients(values.get("opacity_over_time"), count, opacities)
+        is_placed, body_of = values.pop("is_placed", None), values.pop("body_of", None)
+        self.gaussians = GaussianModel(
+            values,
+            self.canonical_time,
+            degree=effects.view_dependence or 0,
+            color_cosines=effects.color_over_time or 0,
+            opacity_cosines=effects.opacity_over_time or 0,
+        )
         lights = exposure.count_of(effects.exposure or 0, start.scene)
-        self.exposure = _coefficients(values.get("exposure"), lights, 2, 3) if lights else None
+        self.exposure = coefficients(values.get("exposure"), lights, 2, 3) if lights else None
         self.lit_cameras = frozenset(frame.camera_id for frame in train if lights)
-        # Of the rounds of density control; the first two are sums since the last round.
-        self.register_buffer("gradient_sum", torch.zeros(count))
-        self.register_buffer("image_count", torch.zeros(count))  # that showed a particle
-        self.register_buffer("unseen_rounds", torch.zeros(count))  # infinite: to be removed
-        self.register_buffer("round", torch.zeros((), dtype=torch.int64))
-        self.least_motion = effects.background
-        rests_at_once = self.box is not None or self.stage.rest_by_masks
-        may_rest = effects.background is not None or (rests_at_once and effects.motion is not None)
-        resting = self.beyond(self.means.data) if may_rest else None
-        if may_rest and self.stage.rest_by_masks and not start.blank:
-            resting |= at_rest(start.scene, self.means.data, surface_of(start.before))
-            if new is not None:
-                resting &= ~new
-        self.register_buffer("resting", resting)
         # Rows of the run that windows of a film begin from: particles that stay as they are; -1: of its own.
         self.register_buffer("shared", values.get("shared"))
-
-        self.nodes = self.skinning = None
+        self.density = DensityControl(len(self.gaussians), self.stage)
+        self.least_motion, self.deformation = effects.background, None
         if effects.motion is not None:
-            still = left_alone(self.shared, self.resting)
-            own = self.means.data if still is None or bool(still.all()) else self.means.data[~still]
-            nodes, knots = self.stage.motion(len(own), len(times))
-            natural = self.stage.natural_splines
-            curve = Curve(effects.motion, knots, len(times), self.canonical_time, straight=natural)
-            offsets = None  # cosines are exactly 0 at the canonical time, and few times do not tell
-            if self.stage.time_offsets and effects.motion == "spline" and len(times) >= _FEWEST_TIMES:
-                offsets = TimeOffsets(times, self.stage.time_offsets)
-            points, edges = None if start.blank else own, self.stage.edges
-            rotates, rests = effects.rotation is not None, effects.background is not None
-            if self.stage.bodies == 0 or not rotates:
-                body_of = None
-            else:
-                body_of = torch.full((len(self.means),), -1) if body_of is None else body_of
-                body_of = body_of if len(own) == len(body_of) else body_of[~still]
-            more = {"rotates": rotates, "rests": rests, "edges": edges, "body_of": body_of, "times": times}
-            self.nodes = Nodes(points, nodes, curve, offsets, **more)
-            self.skinning = Skinning(self.nodes, self.means.data)
-            if still is not None:
-                self.skinning.release(still)
-        self.grows = tuple(name for name in _ROWS if getattr(self, name) is not None)
-        self.grows += () if self.skinning is None else Skinning.ROWS
+            self.deformation = self._deformation(start, effects, is_placed, body_of)
+        self.grows = tuple(f"gaussians.{name}" for name in self.gaussians.rows)
+        self.grows += tuple(f"density.{name}" for name in self.density.ROWS)
+        self.grows += () if self.shared is None else ("shared",)
+        if self.deformation is not None:
+            self.grows += tuple(f"deformation.{name}" for name in self.deformation.rows)
 
-    def _first_values(self, start: Start, sets_down: bool) -> dict[str, Tensor]:
+    def _deformation(
+        self, start: Start, effects: Effects, is_placed: Tensor | None, body_of: Tensor | None
+    ) -> Deformation:
+        """Make nodes on the Gaussians that may move, and let these follow them.
+
+        Args:
+            start, effects: of the method.
+            is_placed, body_of: (N,) bool and int64, see ``contact.place_on_ground``; None: nothing was.
+        """
+        means, times, stage = self.gaussians.means.data, start.scene.instants, self.stage
+        rotates, rests = effects.rotation is not None, effects.background is not None
+        resting, fixed = None, self.fixed
+        if rests or self.box is not None or stage.rest_by_masks:
+            resting = self.beyond(means)
+            if stage.rest_by_masks and not start.blank:
+                resting |= at_rest(start.scene, means, surface_of(start.before))
+                if is_placed is not None:
+                    resting &= ~is_placed
+        static = resting if fixed is None else fixed if resting is None else fixed | resting
+        free = slice(None) if static is None or bool(static.all()) else ~static
+        nodes, knots = stage.motion(len(means[free]), len(times))
+        natural = stage.natural_splines
+        curve = Curve(effects.motion, knots, len(times), self.canonical_time, straight=natural)
+        offsets = None  # cosines are exactly 0 at the canonical time, and few times do not tell
+        if stage.time_offsets and effects.motion == "spline" and len(times) >= _FEWEST_TIMES:
+            offsets = TimeOffsets(times, stage.time_offsets)
+        if stage.bodies == 0 or not rotates:
+            body_of = None
+        else:
+            body_of = (torch.full((len(means),), -1) if body_of is None else body_of)[free]
+        points, edges = None if start.blank else means[free], stage.edges
+        more = {"rotates": rotates, "rests": rests, "edges": edges, "body_of": body_of, "times": times}
+        return Deformation(Nodes(points, nodes, curve, offsets, **more), means, resting, fixed)
+
+    def _first_values(self, start: Start, places: bool) -> dict[str, Tensor]:
         """Return the first value of every parameter: fresh, or of the stage before.
 
         Also register ``covered_pixels``: mean number of pixels of an image that show anything; ``extent``:
@@ -171,25 +179,27 @@ class Particles(Method):
 
         Args:
             start: what it is built from.
-            sets_down: what moves in a film; see ``contact.set_down``.
+            places: whether what moves in a film is put on the ground; see ``contact.place_on_ground``.
 
         Raises:
             ValueError: if the run that a window begins from is not one of particles that stand still.
         """
-        moving = 1.0
+        moving, before = 1.0, start.before
         if start.shares and not start.blank:
-            check_still(start.before)
-        if isinstance(start.before, Particles):
-            before = start.before
+            check_still(isinstance(before, Particles) and (before.shared is not None or before.is_static))
+        if isinstance(before, Particles):
             covered, extent = float(before.covered_pixels), float(before.extent)
+            values = {name: value.to("cpu", copy=True) for name, value in before.values().items()}
             if start.shares and before.shared is None:
-                values, moving = begin_window(before, start, self.stage.initial_share)
+                share, count_of = self.stage.initial_share, before.stage.final_count
+                values, moving = begin_window(
+                    values, before.drawn, start, lambda pixels: round(share * count_of(pixels, before.views))
+                )
             else:
-                values = {n: p.data.to("cpu", copy=True) for n, p in before.named_parameters(recurse=False)}
                 if before.shared is not None:
                     values["shared"], moving = before.shared.to("cpu", copy=True), float(before.moving_pixels)
-                if sets_down and not start.blank:
-                    values = set_down(values, before, start.scene)
+                if places and not before.moves and not start.blank:
+                    values = place_on_ground(values, start.scene, before.drawn, before.light_of)
         elif start.blank:
             covered = extent = 1.0
             values = first_values(Cloud(torch.zeros(1, 3), torch.zeros(1, 3), torch.zeros(1), 1.0))
@@ -204,6 +214,22 @@ class Particles(Method):
         self.register_buffer("final_count", torch.tensor(final_count))
         return values
 
+    def values(self) -> dict[str, Tensor]:
+        """Return all that is learned of Gaussians and exposure, by name."""
+        named = [*self.gaussians.named_parameters(), *self.named_parameters(recurse=False)]
+        return {name: parameter.data for name, parameter in named}
+
+    @property
+    def fixed(self) -> Tensor | None:
+        """Which Gaussians (N,) bool stay as they are, as other windows share them; None: none."""
+        return None if self.shared is None else self.shared >= 0
+
+    @property
+    def is_static(self) -> bool:
+        """Whether nothing changes over time but exposure."""
+        changes = self.gaussians.color_over_time, self.gaussians.opacity_over_time, self.deformation
+        return all(change is None for change in changes)
+
     def beyond(self, points: Tensor) -> Tensor:
         """Return which points (N, 3) lie outside the box in which motion is looked for: bool (N,)."""
         if self.box is None:
@@ -214,36 +240,39 @@ class Particles(Method):
     @property
     def moves(self) -> bool:
         """Whether there is any motion."""
-        return self.nodes is not None
+        return self.deformation is not None
 
     @property
     def size(self) -> tuple[str, int]:
         """See ``Method``."""
-        return "particles", len(self.means)
+        return "particles", len(self.gaussians)
 
     def misfit(self, state: Mapping[str, Tensor]) -> str | None:
         """See ``Method``; what is stored of the skinning must go together with all nodes, too."""
         misfit = super().misfit(state)
-        if misfit or self.nodes is None:
+        if misfit or self.deformation is None:
             return misfit
         links, *others = (state[name] for name in self.loose)
-        fits = len(links) == len(state["means"]) and all(links.shape == other.shape for other in others)
-        return None if fits and are_rows(links, len(state["nodes.positions"])) else self.loose[0]
+        fits = len(links) == len(state["gaussians.means"]) and all(links.shape == t.shape for t in others)
+        fits = fits and are_rows(links, len(state["deformation.nodes.positions"]))
+        return None if fits else self.loose[0]
 
     def at(self, moment: Moment) -> Snapshot:
         """Move every particle; nothing is rendered yet."""
-        warp, bases = self.warp(moment.time), self.time_bases(moment.time)
-        gaussians = self.gaussians(self.light(moment))
+        gaussians, bases = self.gaussians.joined(self.light(moment)), self.gaussians.time_bases(moment.time)
+        warp = self.warp(moment.time)
         return ParticlesSnapshot(moment, gaussians, warp, *bases, self.blur, self.chunk, self.lit_cameras)
 
-    def gaussians(self, light: Tensor | None = None) -> Gaussians:
-        """Return the particles, in a ``light`` or their own, as the operators read them: coefficients of one
-        kind in one tensor.
-        """
-        opacities = [part for part in (self.opacity, self.opacity_over_time) if part is not None]
-        colors = self._joined([getattr(self, name) for name in self._color_parameters()])
-        colors = colors if light is None else exposure.lit(colors, light)
-        return Gaussians(self.means, self.scales, self.quaternions, self._joined(opacities), colors)
+    @torch.no_grad()
+    def drawn(self, frame: Frame) -> Rendering:
+        """Render what a training image shows (H, W), before black."""
+        camera = frame.camera
+        drawn = self.at(_moment_of(frame)).render(View(camera), torch.zeros(3, device=self.device))
+        return drawn.shaped(camera.height, camera.width)
+
+    def light_of(self, frame: Frame) -> Tensor | None:
+        """Return the ``light`` of a training image."""
+        return self.light(_moment_of(frame))
 
     def light(self, moment: Moment) -> Tensor | None:
         """Return the gain and the bias (2, 3) of the colours of an image that a camera of the training images
@@ -258,26 +287,9 @@ class Particles(Method):
     def _drift(self, time: float) -> list[float]:
         return exposure.basis_at(len(self.exposure), time, self.shared is not None)
 
-    @staticmethod
-    def _joined(kinds: list[Tensor]) -> Tensor:
-        return kinds[0] if len(kinds) == 1 else torch.cat(kinds, 1)
-
-    def _color_parameters(self) -> list[str]:
-        """Return the parameters of colour that there are, in the operators' order."""
-        return [name for name in ("colors", "sh", "color_over_time") if getattr(self, name) is not None]
-
     def warp(self, time: float) -> Warp:
-        """Return how all particles move from the canonical state to a time."""
-        if self.nodes is not None:
-            return Warp(self.nodes.maps(time), self.skinning.links, self.skinning.weights())
-        zero = self.means.new_zeros(len(self.means), 1)
-        return Warp(self.means.new_zeros(1, 12), zero.int(), zero)
-
-    def time_bases(self, time: float) -> tuple[Tensor, Tensor]:
-        """Return what a time makes of the coefficients of colour (T,) and of opacity (1 + F,)."""
-        counts = (0 if p is None else p.shape[1] for p in (self.color_over_time, self.opacity_over_time))
-        color, opacity = (cosines(count, time, self.canonical_time) for count in counts)
-        return self.means.new_tensor(color), self.means.new_tensor([1.0, *opacity])
+        """Return how all Gaussians move from the canonical state to a time."""
+        return standing(self.gaussians.means) if self.deformation is None else self.deformation.warp(time)
 
     @torch.no_grad()
     def look(self, batch: Batch, factors: Mapping[str, float], generator: torch.Generator) -> Step:
@@ -285,8 +297,8 @@ class Particles(Method):
         terms, gradients = dict.fromkeys(self.terms, 0.0), {}
         squared, numbers, views, has_depth = 0.0, 0, len(batch.observations), False
         for whole in batch.observations:
-            if self.nodes is not None and self.nodes.led:
-                follow(self, whole, self.frames)
+            if self.deformation is not None and self.deformation.nodes.led:
+                follow(self, whole)
             seen = self._smaller(whole)
             covered = float(self.covered_pixels) * len(seen.view) / len(whole.view)
             squared_error, of_image, found = self._compare(seen, factors, generator, views, covered)
@@ -297,13 +309,13 @@ class Particles(Method):
             has_depth |= seen.sensed is not None
             for name, value in found.items():
                 gradients[name] = gradients[name] + value if name in gradients else value
-        values = {name: (lambda v=v: self.means.new_tensor(v)) for name, v in terms.items()}
+        values = {name: (lambda v=v: self.gaussians.means.new_tensor(v)) for name, v in terms.items()}
         if not has_depth:
             values["depth"] = lambda: None
-        if self.nodes is None:
+        if self.deformation is None:
             values |= dict.fromkeys(("rigid", "smooth", "static"), lambda: None)
         error = torch.tensor(squared / numbers, dtype=torch.float64)
-        return Step(values, error, {"particles": len(self.means)}, gradients)
+        return Step(values, error, {"particles": len(self.gaussians)}, gradients)
 
     def _smaller(self, seen: Observation) -> Observation:
         """Return an image as small as ``image_scale`` has it now; the first ones are kept, as many as fit."""
@@ -332,58 +344,46 @@ class Particles(Method):
         Returns:
             the sum of squared errors; the terms; and the step's gradients, by parameter.
         """
-        time, nodes = self._jittered(seen.moment.time, generator), self.nodes
-        if nodes is None:
-            warp = self.warp(time)
+        time, gaussians = self._jittered(seen.moment.time, generator), self.gaussians
+        deformation, now = self.deformation, None
+        if deformation is None:
+            warp = standing(gaussians.means)
         else:
-            motion_time = nodes.motion_time(time)
-            nodes.extend(motion_time)
-            basis = nodes.summed_basis((motion_time, 1.0))
-            motion, maps = nodes.carried(time, basis)
-            warp = Warp(maps, self.skinning.links, self.skinning.weights())
-        colors, light, terms = self._color_parameters(), self.light(seen.moment), {}
+            now = deformation.at(time)
+            warp = deformation.warp_by(now.maps)
+        light, terms = self.light(seen.moment), {}
         loss = self._image_loss(factors, terms)
         of_colors = factors.get("photo", 0.0) if loss is None else 1.0
         sensed = seen.sensed if "depth" in factors else None
         by_depth = factors.get("depth", 0.0) / of_colors
         more = {"loss": loss, "sensed": sensed, "by_depth": by_depth}
         compared = self.compared(
-            seen, self.gaussians(light), warp, time, of_colors / (covered * views), **more
+            seen, gaussians.joined(light), warp, time, of_colors / (covered * views), **more
         )
         terms = {"depth": compared.depth} | (terms or {"photo": compared.loss})
         terms = {name: value / covered for name, value in terms.items()}
-        by_place = compared.pixel_gradient
-        if self.shared is not None:
-            by_place = by_place.masked_fill(self.shared >= 0, 0.0)
-        shown = by_place > 0
-        self.gradient_sum.add_(by_place)
-        self.image_count.add_(shown)
-        self.shown_now.append(shown)
-        if self.progress < self.stage.density_until:
-            self.unseen_rounds[density.too_near(compared.order, compared.distances)] = math.inf
-        means, scales, quaternions, opacity, by_kind = compared.particles
-        gradients = {"means": means, "scales": scales, "quaternions": quaternions, "opacity": opacity[:, :1]}
+        by_place, fixed = compared.pixel_gradient, self.fixed
+        self.density.count(by_place if fixed is None else by_place.masked_fill(fixed, 0.0))
+        self.density.mark_too_near(self.progress, compared.order, compared.distances)
+        gradients, found = {}, compared.particles
         if light is not None:
-            unlit, drift = [getattr(self, name) for name in colors], self._drift(seen.moment.time)
-            by_kind, gradients["exposure"] = exposure.to_unlit(unlit, by_kind, light, drift)
-        gradients |= dict(zip(colors, by_kind, strict=True))
-        if self.opacity_over_time is not None:
-            gradients["opacity_over_time"] = opacity[:, 1:]
-        if nodes is not None:
+            unlit, drift = (
+                [getattr(gaussians, n) for n in gaussians.color_names],
+                self._drift(seen.moment.time),
+            )
+            by_kind, gradients["exposure"] = exposure.to_unlit(unlit, found.colors, light, drift)
+            found = found._replace(colors=by_kind)
+        gradients |= {f"gaussians.{name}": value for name, value in gaussians.split(found).items()}
+        if now is not None:
             rigid = factors.get("rigid", 0.0) * self.stage.rigid_final_factor**self.progress
-            edges = nodes.edges, nodes.edge_weights
-            by_motion, terms["rigid"] = pull_nodes(motion, nodes.positions, compared.maps, *edges, rigid)
-            smooth, extent = factors.get("smooth", 0.0), float(self.extent)
-            if "static" in factors:
-                to_rest, terms["static"] = nodes.pull_to_rest(motion, factors["static"], extent)
-                by_motion = by_motion + to_rest
-            if nodes.led:
-                gradients["nodes.bodies.twists"] = nodes.bodies.gradients(time, compared.maps)
-            terms["smooth"], of_nodes = nodes.backward(time, motion_time, basis, by_motion, smooth, extent)
-            gradients |= {"skinning.logits": compared.skin, **of_nodes}
-        if self.shared is not None:
+            factors, extent = dict(factors) | {"rigid": rigid}, float(self.extent)
+            of_motion, by_nodes = deformation.gradients(now, compared.maps, factors, extent)
+            terms |= of_motion
+            by_nodes["skinning.logits"] = compared.skin
+            gradients |= {f"deformation.{name}": value for name, value in by_nodes.items()}
+        if fixed is not None:
             for name in gradients.keys() & {*self.grows}:
-                gradients[name][self.shared >= 0] = 0.0  # the optimiser passes over them
+                gradients[name][fixed] = 0.0  # the optimiser passes over them
         return compared.squared, terms, gradients
 
     def compared(
@@ -392,10 +392,10 @@ class Particles(Method):
     ) -> ImageLoss:  # fmt: skip
         """Compare particles, moved by a warp, with an image; see ``ops.gaussians.compare``."""
         return compare(
-            particles, warp, pinhole_of(seen.view.camera, self.blur), *self.time_bases(time),
+            particles, warp, pinhole_of(seen.view.camera, self.blur), *self.gaussians.time_bases(time),
             seen.rgb, seen.background, width=self.width, factor=factor, by_skin=self.moves,
-            kinds=[getattr(self, name).shape[1] for name in self._color_parameters()], loss=loss,
-            valid=seen.valid, sensed=sensed, by_depth=by_depth, deep=self.deep, chunk=self.chunk,
+            kinds=self.gaussians.color_kinds, loss=loss, valid=seen.valid, sensed=sensed,
+            by_depth=by_depth, deep=self.deep, chunk=self.chunk,
         )  # fmt: skip
 
     def _image_loss(self, factors: Mapping[str, float], terms: dict[str, float]) -> Callable | None:
@@ -417,7 +417,7 @@ class Particles(Method):
     def _jittered(self, time: float, generator: torch.Generator) -> float:
         """Shift an image's time at random, less and less, so that curves do not follow single images."""
         deviation = self.stage.jitter * max(0.0, 1 - self.progress / self.stage.jitter_until)
-        if self.nodes is None or self.nodes.led or deviation == 0:
+        if self.deformation is None or self.deformation.nodes.led or deviation == 0:
             return time
         return min(1.0, max(0.0, time + deviation * float(torch.randn((), generator=generator))))
 
@@ -427,48 +427,78 @@ class Particles(Method):
         Rates of lengths are of the scene's extent; that of the skinning follows the number of images, and the
         decays of opacity the rate of opacity.
         """
-        self.progress, stage = progress, self.stage
-        if self.nodes is not None and self.nodes.led and progress >= stage.bodies:
+        self.progress, stage, deformation = progress, self.stage, self.deformation
+        if deformation is not None and deformation.nodes.led and progress >= stage.bodies:
             put_on_ground(self)
-            self.nodes.take_over()
-        density.bound_opacity(self)
+            deformation.nodes.take_over()
+        self.gaussians.bound_opacity()
         for group in optimizer.param_groups:
             if group["name"] in ("means", "node_translations", "node_bodies"):
                 group["lr"] *= float(self.extent)
             elif group["name"] == "time_offsets":
-                self.nodes.time_offsets.learns = progress >= stage.jitter_until
-                if self.nodes.time_offsets.learns:
-                    self.nodes.time_offsets.settle(group["lr"])
+                offsets = deformation.nodes.time_offsets
+                offsets.learns = progress >= stage.jitter_until
+                if offsets.learns:
+                    offsets.settle(group["lr"])
             elif group["name"] == "opacity":
                 learns = group["lr"] / (group["base_lr"] or 1.0)
                 decay = stage.decay(float(self.final_count), float(self.covered_pixels))
-                self.decay = min(0.99, decay * learns)  # rates may rise
-                self.hidden_decay = min(0.99, stage.hidden_decay * learns)
+                self.density.decay = min(0.99, decay * learns)  # rates may rise
+                self.density.hidden_decay = min(0.99, stage.hidden_decay * learns)
             elif group["name"] == "skinning":
                 group["lr"] *= view_share(self.views)
-        number = int(progress / stage.density_interval)
-        if number > int(self.round) and progress < stage.density_until:
-            self.round.fill_(number)
-            density.control(self, progress, optimizer)
+        if self.density.is_due(progress):
+            self.control_density(progress, optimizer)
         return {}
+
+    @torch.no_grad()
+    def control_density(self, progress: float, optimizer: torch.optim.Optimizer) -> None:
+        """Run a round of density control; every few rounds, link particles to nodes anew, and let nodes rest.
+
+        Args:
+            progress: fraction of the stage that is done.
+            optimizer: whose moments follow.
+        """
+        stage, deformation, all_times = self.stage, self.deformation, False
+        if deformation is not None:
+            first, last = deformation.nodes.seen_times.tolist()
+            all_times = first <= self.ends[0] + 0.02 and last >= self.ends[1] - 0.02
+        self.density.densify_and_prune(
+            self.gaussians,
+            round(float(self.final_count) * stage.share_at(progress)),
+            partial(take_rows, self, optimizer),
+            extent=float(self.extent),
+            far=self.beyond(self.gaussians.means.data),
+            fixed=self.fixed,
+            all_times=all_times,
+        )
+        if deformation is None or int(self.density.round) % stage.relink:
+            return
+        deformation.reskin(self.gaussians.means.data, optimizer, self.fixed)
+        if self.least_motion is not None and progress >= stage.rest_from and not deformation.nodes.led:
+            least = max(self.least_motion, pixel_width(float(self.covered_pixels))) * float(self.extent)
+            deformation.freeze_static_nodes(self.gaussians, self.ends, least, self.fixed)
 
     def warm_up(self) -> None:
         """Compile the operators' kernels."""
-        compile_kernels(self)
+        compile_kernels(self.gaussians.means, self.has_planes)
 
     def param_groups(self) -> dict[str, list[nn.Parameter]]:
         """See ``Method``."""
-        groups = {name: [p] for name, p in self.named_parameters(recurse=False)}
-        if self.nodes is not None:
-            groups |= {"skinning": [self.skinning.logits]} | self.nodes.param_groups()
+        named = [*self.gaussians.named_parameters(), *self.named_parameters(recurse=False)]
+        groups = {name: [parameter] for name, parameter in named}
+        if self.deformation is not None:
+            groups |= {"skinning": [self.deformation.skinning.logits]} | self.deformation.nodes.param_groups()
         return groups
 
     def optimizer(self, groups: list[dict]) -> torch.optim.Optimizer:
         """Make an Adam that passes over unseen rows; after a step, let the opacity of what was seen decay."""
         optimizer = RowsAdam(groups)
-        optimizer.register_step_post_hook(lambda *_: density.decay_opacity(self))
-        if self.nodes is not None and self.nodes.bodies is not None:
-            optimizer.register_step_post_hook(lambda *_: self.nodes.bodies.settle())
+        optimizer.register_step_post_hook(
+            lambda *_: self.density.decay_opacity(self.gaussians.opacity, self.fixed)
+        )
+        if self.deformation is not None and self.deformation.nodes.bodies is not None:
+            optimizer.register_step_post_hook(lambda *_: self.deformation.nodes.bodies.settle())
         return optimizer
 
     def protocol(self) -> dict[str, str]:
@@ -484,21 +514,30 @@ class Particles(Method):
     @torch.no_grad()
     def moving(self) -> MovingGaussians:
         """See ``HasMovingGaussians``: all particles, in their order."""
-        motion, nodes = None, self.nodes
-        if nodes is not None:
+        motion, gaussians = None, self.gaussians
+        if self.deformation is not None:
+            nodes, skinning = self.deformation.nodes, self.deformation.skinning
             if nodes.led:
                 nodes = copy.deepcopy(nodes)
                 nodes.take_over()
             offsets = nodes.time_offsets
             times = [] if offsets is None else offsets.times
             curves = nodes.translations.data, _data(nodes.rotations), nodes.curve
-            skinning = self.skinning.links, self.skinning.weights()
             corrections = [offsets(time) - time for time in times]
-            motion = NodeMotion(nodes.positions, *curves, *skinning, times, corrections)
-        harmonics = self.colors if self.sh is None else torch.cat([self.colors, self.sh], 1)
-        canonical = self.means.data, self.scales.data, self.quaternions.data, self.opacity.data[:, 0]
-        over_time = _data(self.color_over_time), _data(self.opacity_over_time), self.canonical_time
-        return MovingGaussians(*canonical, harmonics.data, *over_time, self.blur, motion)
+            followed = skinning.links, skinning.weights()
+            motion = NodeMotion(nodes.positions, *curves, *followed, times, corrections)
+        return MovingGaussians(
+            gaussians.means.data,
+            gaussians.scales.data,
+            gaussians.quaternions.data,
+            gaussians.opacity.data[:, 0],
+            gaussians.harmonics(),
+            _data(gaussians.color_over_time),
+            _data(gaussians.opacity_over_time),
+            self.canonical_time,
+            self.blur,
+            motion,
+        )
 
     @torch.no_grad()
     def in_motion(self, frames: Sequence[Frame]) -> Tensor:
@@ -509,10 +548,11 @@ class Particles(Method):
 
         Cost: 256 places in an image for each particle.
         """
-        if self.nodes is None:
-            return torch.zeros(len(self.means), dtype=torch.bool, device=self.means.device)
+        means = self.gaussians.means.data
+        if self.deformation is None:
+            return torch.zeros(len(means), dtype=torch.bool, device=means.device)
         frames = [frames[number] for number in spread(len(frames), _FRAMES)]
-        places = torch.stack([moved(self.means.data, self.warp(frame.time))[0] for frame in frames])
+        places = torch.stack([moved(means, self.warp(frame.time))[0] for frame in frames])
         shown = torch.stack([_in_image(frame.camera, now) for frame, now in zip(frames, places)])  # (F, N)
         ranges = []
         for number in spread(len(frames), _CAMERAS):
@@ -521,8 +561,8 @@ class Particles(Method):
             away = ((pixels - mean).norm(dim=-1) * shown).amax(0)
             ranges.append(torch.where(((depth > 0) | ~shown).all(0), away, torch.nan))
         ranges = torch.stack(ranges).nanmedian(0).values.nan_to_num()
-        beside = nearest(self.means.data, self.means.data, _ALIKE)[1]
-        return (ranges[beside].median(-1).values > MOVES) & (self.skinning.shares.sum(-1) > 0)
+        beside = nearest(means, means, _ALIKE)[1]
+        return (ranges[beside].median(-1).values > MOVES) & (self.deformation.skinning.shares.sum(-1) > 0)
 
     def common(self) -> Tensor | None:
         """See ``HasCommon``."""
@@ -538,14 +578,15 @@ class Particles(Method):
     @torch.no_grad()
     def bounds(self, times: list[float]) -> Box | None:
         """See ``HasBounds``."""
-        solid = torch.sigmoid(density.most_opaque(self)) > _SOLID
+        solid = torch.sigmoid(self.gaussians.most_opaque()) > _SOLID
         if not bool(solid.any()):
             return None
-        low, high = self.means.new_full((3,), torch.inf), self.means.new_full((3,), -torch.inf)
+        means = self.gaussians.means.data
+        low, high = means.new_full((3,), torch.inf), means.new_full((3,), -torch.inf)
         for time in times:  # one at a time, as all places of all particles may take gigabytes
-            points = moved(self.means.data, self.warp(time))[0][solid]
+            points = moved(means, self.warp(time))[0][solid]
             low, high = torch.minimum(low, points.amin(0)), torch.maximum(high, points.amax(0))
-        pad = 2 * float(self.scales[solid].exp().median()) + 1e-3 * float(self.extent)
+        pad = 2 * float(self.gaussians.scales[solid].exp().median()) + 1e-3 * float(self.extent)
         return Box(low - pad, high + pad)
 
     def matter(self) -> Cloud:
@@ -559,7 +600,7 @@ class Particles(Method):
     @torch.no_grad()
     def carried(self, view: View, moment: Moment, to: Moment) -> Tensor:
         """See ``CarriesPixels``."""
-        return self.at(moment).carried(view, moved(self.means.data, self.warp(to.time))[0])
+        return self.at(moment).carried(view, moved(self.gaussians.means.data, self.warp(to.time))[0])
 
     def ellipsoids(self, time: float) -> Ellipsoids:
         """See ``HasEllipsoids``."""
@@ -574,30 +615,28 @@ class Particles(Method):
         return self.moving().movement(times)
 
 
-def _coefficients(before: Tensor | None, *shape: int) -> nn.Parameter | None:
-    """Make an effect's coefficients (N, K, ...): those of the stage before, if it has as many, else 0.
-
-    None where the effect is off (K = 0).
-    """
-    if shape[1] == 0:
-        return None
-    return nn.Parameter(before if before is not None and before.shape == shape else torch.zeros(shape))
-
-
 def surface_of(method: Method | None) -> Callable[[Frame], Tensor] | None:
     """Return what renders how far away the surface is in an image, (H, W), 0 where there is none, from
     particles of the stage before; None without them.
     """
-    if not isinstance(method, Particles):
-        return None
+    return (lambda frame: known_depth(method.drawn(frame))) if isinstance(method, Particles) else None
 
-    @torch.no_grad()
-    def surface(frame: Frame) -> Tensor:
-        camera = frame.camera
-        drawn = method.at(Moment(frame.time)).render(View(camera), torch.zeros(3, device=method.device))
-        return known_depth(drawn.shaped(camera.height, camera.width))
 
-    return surface
+def _moment_of(frame: Frame) -> Moment:
+    """Return the moment of a training image, in its light."""
+    return Moment(frame.time, camera=frame.camera_id, filmed=True)
+
+
+def pixel_width(covered: float) -> float:
+    """Return the width of a pixel as a share of the scene's extent, from the number of covered pixels.
+
+    Roughly: as of a disc that fills the covered pixels, whose extent (the median distance from its middle) is
+    its radius over the root of 2. Of images that show a part of the scene each it is too large.
+
+    >>> round(pixel_width(20_000.0), 4)
+    0.0177
+    """
+    return math.sqrt(2 * math.pi / max(covered, 1.0))
 
 
 def _data(parameter: Tensor | None) -> Tensor | None:

@@ -308,7 +308,7 @@ class Nodes(nn.Module):
             velocity = self.summed_basis((late, 0.5 / _HALF_STEP), (early, -0.5 / _HALF_STEP))
             by_time = (self.motion_and_maps(velocity)[0].detach() * by_motion).sum().item()
             gradients.append(self.time_offsets.gradients(time, by_time))
-        names = ("nodes.translations", "nodes.rotations", "nodes.time_offsets.values")
+        names = ("translations", "rotations", "time_offsets.values")
         return bent, {name: value for name, value in zip(names, gradients) if value is not None}
 
     @torch.no_grad()
@@ -386,7 +386,7 @@ class Skinning(nn.Module):
     that move apart learns which of them it belongs to. A particle at rest has the shares 0, and follows none.
     """
 
-    ROWS = ("skinning.links", "skinning.shares", "skinning.logits")
+    ROWS = ("links", "shares", "logits")
 
     def __init__(self, nodes: Nodes, points: Tensor) -> None:
         super().__init__()

@@ -193,11 +193,11 @@ class Numbers:
 
 
 EFFECTS = (
-    Effect("motion", attribute="nodes", of=Evidence.of_time),
-    Effect("rotation", attribute="nodes.rotations", needs="motion"),
-    Effect("background", attribute="nodes.stopped", needs="motion"),
-    Effect("opacity_over_time", of=Evidence.of_time),
-    Effect("color_over_time", of=Evidence.of_time),
+    Effect("motion", attribute="deformation", of=Evidence.of_time),
+    Effect("rotation", attribute="deformation.nodes.rotations", needs="motion"),
+    Effect("background", attribute="deformation.nodes.stopped", needs="motion"),
+    Effect("opacity_over_time", attribute="gaussians.opacity_over_time", of=Evidence.of_time),
+    Effect("color_over_time", attribute="gaussians.color_over_time", of=Evidence.of_time),
     Effect("exposure", of=Evidence.of_exposure),
-    Effect("view_dependence", attribute="sh", of=Evidence.of_direction),
+    Effect("view_dependence", attribute="gaussians.sh", of=Evidence.of_direction),
 )

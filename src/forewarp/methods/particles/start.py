@@ -497,13 +497,17 @@ def seen_colors(points: Tensor, cameras: Sequence[Camera], images: Sequence[Tens
 
 
 @torch.no_grad()
-def compile_kernels(method: torch.nn.Module) -> None:
-    """Run each operator once on a single particle; nothing random is drawn, the method is not touched.
+def compile_kernels(means: Tensor, has_planes: bool) -> None:
+    """Run each operator once on a single particle; nothing random is drawn.
 
-    What was never compiled on a machine is compiled by two processes, where it has two cores. A method that
-    uses none of the kernels, as on a GPU, has nothing to compile.
+    What was never compiled on a machine is compiled by two processes, where it has two cores. Where no kernel
+    is used, as on a GPU, there is nothing to compile.
+
+    Args:
+        means: of particles, which are not touched: they say which device it is.
+        has_planes: whether images come with planes beside their colours.
     """
-    if not use_numba(method.means):
+    if not use_numba(means):
         return
     from forewarp.ops.kernels import nodes as kernels
 
@@ -520,7 +524,7 @@ def compile_kernels(method: torch.nn.Module) -> None:
         skin_weights(one, one)
         moments = zero.clone(), zero.clone(), first.clone()
         adam_rows([AdamState(torch.zeros(1, 3), torch.ones(1, 3), *moments, 1e-3)], (0.9, 0.99), 1e-15)
-    valid = torch.ones(72, dtype=torch.bool) if method.has_planes else None
+    valid = torch.ones(72, dtype=torch.bool) if has_planes else None
     compare(*given, torch.zeros(72, 4, dtype=torch.uint8), torch.ones(3), valid=valid)
 
 

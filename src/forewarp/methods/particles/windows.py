@@ -4,20 +4,17 @@ on what moves.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
-from forewarp.methods.method import Method, Start
+from forewarp.methods.method import Start
 from forewarp.methods.particles.start import first_points, first_values, widths
 from forewarp.ops.grid import dilate
 from forewarp.scene.frame import Frame, Scene, instants_of, sightings, spread
-from forewarp.scene.view import Moment, View
-
-if TYPE_CHECKING:
-    from forewarp.methods.particles.model import Particles
+from forewarp.scene.view import Rendering
 
 _MOMENTS, _CAMERAS = 6, 12  # at which, and by how many cameras of each, it is looked at what moves
 _WRONG = 0.05, 0.15  # error from which on a pixel is wrong: thrice its image's mean, but at least and at most
@@ -28,16 +25,16 @@ _POINTS = 4096  # tried on what moves
 _FEW = 16  # particles that are too few to move
 
 
-def check_still(before: Method) -> None:
+def check_still(is_still: bool) -> None:
     """Refuse a method that no window can begin from: times of a window are not those of another run.
 
+    Args:
+        is_still: whether it is of particles that do not change over time, or of a window itself.
+
     Raises:
-        ValueError: for one that is not made of particles, or whose particles change over time, unless it is
-            of a window itself.
+        ValueError: if not.
     """
-    over_time = ("nodes", "color_over_time", "opacity_over_time")
-    stands = hasattr(before, "shared") and all(getattr(before, name) is None for name in over_time)
-    if not stands and getattr(before, "shared", None) is None:
+    if not is_still:
         made = "make it by the same command with windows=still, without data.window and start"
         raise ValueError(
             f"start: expected a run of model=particles that stand still, but got one of another kind; {made}"
@@ -45,32 +42,38 @@ def check_still(before: Method) -> None:
 
 
 @torch.no_grad()
-def begin_window(still: Particles, start: Start, share: float) -> tuple[dict[str, Tensor], float]:
+def begin_window(
+    still: Mapping[str, Tensor],
+    draw: Callable[[Frame], Rendering],
+    start: Start,
+    count_of: Callable[[float], int],
+) -> tuple[dict[str, Tensor], float]:
     """Return the first values of a window's particles, and how many pixels of an image show what moves.
 
     First come those of ``still``, then new ones on what moves at the canonical time. ``shared`` (N,) int64
     holds the row in ``still`` of those that the window leaves as they are, else -1.
 
     Args:
-        still: fitted to all of the film, at rest.
+        still: values by name, fitted to all of the film, at rest.
+        draw: renders them as an image shows them, (H, W).
         start: of the window.
-        share: of the number that the moving pixels ask for, which new particles may be.
+        count_of: returns for the number of moving pixels how many new particles there may be.
 
     Cost: some 70 images are rendered; and that of ``first_points``.
     """
-    scene, means = start.scene, still.means.data
+    scene, means = start.scene, still["means"]
     own, pixels = torch.zeros(len(means), dtype=torch.bool), []
     for frames in moments_of(scene):
-        masks = [wrong_pixels(still, frame) for frame in frames]
+        masks = [wrong_pixels(draw, frame) for frame in frames]
         wrong, seen = sightings(means, [frame.camera for frame in frames], masks)
         own |= (seen > 0) & (wrong >= _MOVES * seen)
         pixels += [float(mask.sum()) for mask in masks]
     if int(own.sum()) < _FEW:
         own[:_FEW] = True
     moving_pixels = max(sum(pixels) / len(pixels), float(_FEW))
-    values = {name: p.data.to("cpu", copy=True) for name, p in still.named_parameters(recurse=False)}
-    values.pop("exposure", None)  # its times are those of the whole film
-    fresh = _on_what_moves(still, start, round(share * still.stage.final_count(moving_pixels, still.views)))
+    # Times of its exposure are those of the whole film.
+    values = {name: value for name, value in still.items() if name != "exposure"}
+    fresh = _on_what_moves(draw, start, count_of(moving_pixels))
     if fresh:
         count = len(fresh["means"])
         fresh |= {n: v.new_zeros(count, *v.shape[1:]) for n, v in values.items() if n not in fresh}
@@ -80,13 +83,13 @@ def begin_window(still: Particles, start: Start, share: float) -> tuple[dict[str
     return values, moving_pixels
 
 
-def _on_what_moves(still: Particles, start: Start, count: int) -> dict[str, Tensor]:
-    """Make at most ``count`` particles where images of the canonical time show ``still`` to be wrong."""
+def _on_what_moves(draw: Callable[[Frame], Rendering], start: Start, count: int) -> dict[str, Tensor]:
+    """Make at most ``count`` particles where what stands still is wrong in images of the canonical time."""
     scene = start.scene
     cloud = first_points(replace(start, handover=None), _POINTS)
     canonical = min(scene.instants, key=lambda time: abs(time - scene.canonical_time))
     now = _frames_at(scene, canonical)
-    masks = [wrong_pixels(still, frame) for frame in now]
+    masks = [wrong_pixels(draw, frame) for frame in now]
     wrong, seen = sightings(cloud.points, [frame.camera for frame in now], masks)
     rows = ((seen > 0) & (wrong >= _NEW * seen)).nonzero()[:, 0]
     if not len(rows):
@@ -109,22 +112,17 @@ def _frames_at(scene: Scene, instant: float) -> list[Frame]:
 
 
 @torch.no_grad()
-def wrong_pixels(still: Particles, frame: Frame) -> Tensor:
-    """Return which pixels (H, W) of an image ``still`` does not show, and what is beside them."""
-    rgba = frame.load().float() / 255
-    view, black = View(frame.camera), torch.zeros(3)
-    drawn = still.at(Moment(frame.time, camera=frame.camera_id, filmed=True)).render(view, black).rgb
-    height, width = frame.camera.height, frame.camera.width
-    error = (drawn.reshape(height, width, 3) - rgba[..., :3] * rgba[..., 3:]).abs().mean(-1)
+def wrong_pixels(draw: Callable[[Frame], Rendering], frame: Frame) -> Tensor:
+    """Return which pixels (H, W) of an image what stands still does not show, and what is beside them.
+
+    Args:
+        draw: renders what stands still as an image shows it, (H, W).
+        frame: the image.
+    """
+    rgba, width = frame.load().float() / 255, frame.camera.width
+    error = (draw(frame).rgb - rgba[..., :3] * rgba[..., 3:]).abs().mean(-1)
     smooth = torch.nn.functional.avg_pool2d(error[None, None], 3, 1, 1, count_include_pad=False)[0, 0]
     wrong = smooth > (3 * error.mean()).clamp(*_WRONG)
     if frame.load_valid is not None:
         wrong &= frame.load_valid()
     return dilate(wrong, max(1, round(_GROWN * width)))
-
-
-def left_alone(shared: Tensor | None, resting: Tensor | None) -> Tensor | None:
-    """Return which particles (N,) follow no node: those shared, and those at rest; None where none can."""
-    if shared is None or resting is None:
-        return resting if shared is None else shared >= 0
-    return (shared >= 0) | resting

@@ -6,9 +6,9 @@ import pytest
 import torch
 
 from forewarp.methods.method import Start
-from forewarp.methods.particles import density, shared
+from forewarp.methods.particles import windows
 from forewarp.methods.particles.model import Particles
-from forewarp.methods.particles.shared import left_alone, moments_of, wrong_pixels
+from forewarp.methods.particles.windows import moments_of, wrong_pixels
 from tests.support.particles import BARE, EVERY, look, module_with, small_data
 
 DATA = small_data()
@@ -25,7 +25,7 @@ def begun(before, *, blank=False, **effects):
 def still():
     """Particles at rest, most of which lie where nothing ever moves."""
     method = module_with(DATA, **BARE).method
-    method.means.data[20:] += torch.tensor([0.0, 0.0, 9.0])
+    method.gaussians.means.data[20:] += torch.tensor([0.0, 0.0, 9.0])
     return method
 
 
@@ -39,14 +39,16 @@ def window(still):
 def test_a_window_keeps_what_stands_still_and_adds_particles_on_what_moves(still, window):
     method = window.method
     kept = method.shared >= 0
-    assert 10 < int(kept.sum()) < len(method.means)
-    assert torch.equal(method.means[kept], still.means[method.shared[kept]])
-    assert torch.equal(method.opacity[kept], still.opacity[method.shared[kept]])
-    assert not bool(method.skinning.shares[kept].any())
-    assert bool((method.skinning.shares[~kept].sum(-1) > 0.99).all())
-    own = {tuple(row) for row in method.means[~kept].tolist()}
-    assert {tuple(row) for row in method.nodes.positions.tolist()} <= own  # nodes follow what moves
-    assert int((~kept).sum()) > int((still.means[:, 2] < 5).sum())  # some are new
+    assert 10 < int(kept.sum()) < len(method.gaussians.means)
+    assert torch.equal(method.gaussians.means[kept], still.gaussians.means[method.shared[kept]])
+    assert torch.equal(method.gaussians.opacity[kept], still.gaussians.opacity[method.shared[kept]])
+    assert not bool(method.deformation.skinning.shares[kept].any())
+    assert bool((method.deformation.skinning.shares[~kept].sum(-1) > 0.99).all())
+    own = {tuple(row) for row in method.gaussians.means[~kept].tolist()}
+    assert {
+        tuple(row) for row in method.deformation.nodes.positions.tolist()
+    } <= own  # nodes follow what moves
+    assert int((~kept).sum()) > int((still.gaussians.means[:, 2] < 5).sum())  # some are new
     assert 16 <= float(method.moving_pixels) < 400
 
 
@@ -57,18 +59,19 @@ def test_training_changes_nothing_of_what_is_shared(still, window):
         for name, p in method.named_parameters():
             p.grad = step.gradients.get(name)
         optimizer.step()
-    density.renew(method, 2 * len(method.means), optimizer)
-    method.resting[0] = True
-    density.come_to_rest(method, 1e-4)
-    method.skinning.relink(method.nodes, method.means.data, optimizer)
+    method.final_count.fill_(2 * len(method.gaussians.means))
+    method.control_density(1.0, optimizer)
+    method.deformation.resting[0] = True
+    method.deformation.freeze_static_nodes(method.gaussians, method.ends, 1e-4, method.fixed)
+    method.deformation.reskin(method.gaussians.means.data, optimizer, method.fixed)
     kept = method.shared >= 0
     rows = method.shared[kept]
     for name in ("means", "scales", "quaternions", "opacity", "colors"):
-        assert torch.equal(getattr(method, name)[kept], getattr(still, name)[rows]), name
-    assert not bool(method.color_over_time[kept].any())
+        own, theirs = (getattr(particles.gaussians, name) for particles in (method, still))
+        assert torch.equal(own[kept], theirs[rows]), name
+    assert not bool(method.gaussians.color_over_time[kept].any())
     assert len(rows.unique()) == len(rows)
-    method.skinning.release(left_alone(method.shared, method.resting))
-    assert torch.equal(method.ellipsoids(1.0).centers[kept], method.means[kept])
+    assert torch.equal(method.ellipsoids(1.0).centers[kept], method.gaussians.means[kept])
 
 
 @pytest.mark.slow
@@ -96,9 +99,9 @@ def test_cameras_that_film_together_at_times_of_their_own_are_asked_together(sti
     assert [[frame.moment for frame in frames] for frames in moments_of(scene)] == [[i, i] for i in range(6)]
     asked = []
     monkeypatch.setattr(
-        shared, "wrong_pixels", lambda still, frame: asked.append(frame) or frame.load()[..., 3] > 0
+        windows, "wrong_pixels", lambda draw, frame: asked.append(frame) or frame.load()[..., 3] > 0
     )
-    shared._on_what_moves(still, Start(scene, "fine", {}, [0], None, still, shares=True), 10)
+    windows._on_what_moves(still.drawn, Start(scene, "fine", {}, [0], None, still, shares=True), 10)
     assert [frame.moment for frame in asked] == [0, 0]
 
 
@@ -116,7 +119,7 @@ def test_a_window_begins_from_particles_that_stand_still_alone(still):
 
 def test_a_window_learns_its_exposure_anew(monkeypatch):
     """Curves over the times of the whole film say something else at a window's times."""
-    monkeypatch.setattr(shared, "_on_what_moves", lambda *given: {})
+    monkeypatch.setattr(windows, "_on_what_moves", lambda *given: {})
     before = module_with(DATA, **(BARE | {"exposure": 1})).method
     before.exposure.data.fill_(0.1)
     window = begun(before, **(BARE | {"exposure": 1}))
@@ -126,8 +129,8 @@ def test_a_window_learns_its_exposure_anew(monkeypatch):
 
 def test_pixels_are_wrong_where_an_image_shows_something_else():
     method = module_with(DATA, **BARE).method
-    method.opacity.data.fill_(-9.0)  # nothing is drawn
+    method.gaussians.opacity.data.fill_(-9.0)  # nothing is drawn
     frame = DATA.scene.train[0]
-    wrong, shown = wrong_pixels(method, frame), frame.load()[..., 3] > 127
+    wrong, shown = wrong_pixels(method.drawn, frame), frame.load()[..., 3] > 127
     assert bool(wrong[shown].all())
     assert int(wrong.sum()) < 4 * int(shown.sum())
