@@ -151,6 +151,40 @@ def test_points_that_never_move_tell_the_unit_of_depth(tmp_path):
     assert doubt_depths([frame], 1.0, None, "toy", "") == []
 
 
+STRETCHED = {  # how depths of three images are changed, and what is said of them
+    "to 16 bits": (
+        lambda d, k: np.uint16(65535 * (d - d.min()) / np.ptp(d)),
+        "of each is 65535, of few pixels",
+    ),
+    "to 1": (lambda d, k: d / d.max(), "of each is 1, of few pixels; do so"),
+    "to ends of its own": (
+        lambda d, k: (2 + k) * (d - 1),
+        "points that never move fit each with another scale",
+    ),
+    "a number for none": (lambda d, k: np.uint16(np.where(d < d.max(), 1000 * d, 65535)), None),
+    "one unit": (lambda d, k: np.uint16(1000 * d), None),
+    "one moved point": (lambda d, k: d + 0.3 * (d > 2.9), None),
+}
+
+
+@pytest.mark.parametrize("how", STRETCHED)
+def test_depths_that_were_stretched_each_by_itself_are_named(tmp_path, how):
+    (change, said), camera, frames = STRETCHED[how], camera_of(), []
+    depth, points = wall(camera)
+    depth[5, -1] += 0.02  # alone the largest
+    image = torch.zeros(24, 32, 4, dtype=torch.uint8)
+    for k in range(3):
+        np.save(tmp_path / f"{k}.npy", values := change(depth, k))
+        known = points if "own" in how or "one" in how else None
+        load = SensedDepth(
+            tmp_path / f"{k}.npy", camera, 1e-3 if values.dtype == np.uint16 else 1.0, known=known
+        )
+        frames.append(Frame(str(k), k / 2, camera, lambda: image, load_sensed=load))
+    lines = doubt_depths(frames, 1.0, None, "toy", "set data.depth_scale={}", stretched="do so")
+    assert any("different images seem to have different units" in line for line in lines) == bool(said)
+    assert (said or "") in lines[0] if said else True
+
+
 def test_a_line_needs_points_that_agree():
     given = np.arange(30.0)
     assert line_through(given[:9], given[:9] + 1) is None

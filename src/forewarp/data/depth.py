@@ -33,6 +33,8 @@ _LEANS = 0.65, 1.5  # between which the other kind is right
 _BEYOND = 2.0  # share of near and far within which the median of depths of the right unit lies
 _NOWHERE = 10.0  # multiple of far, beyond which nothing is measured
 _REPEATED, _SEVERAL = 0.002, 2  # share and number of pixels of the largest depth, from which on it is none
+_ENDS, _GAP = (1.0, 255.0), 0.05  # ends of ranges of real numbers; share below an end in which others lie
+_FITTED = 3  # images, at least, that tell whether all are in one unit
 _BELOW, _STANDS_OUT = 0.02, 5  # share below the largest, and how many times as often as any depth there it is
 _PLACED = 2e-3  # share by which the largest depths of views contradict each other if they are none
 _COLORED = 6  # groups of views whose colours are compared, at most
@@ -255,10 +257,11 @@ def doubt_depths(
     *,
     far_key: str = "set data.far",
     usual: str = "axis",
+    stretched: str = "write depths of one unit",
 ) -> list[str]:
     """Say in lines which numbers of metric depths are taken for holes, that hardly any is trusted, and that
-    depths are in another unit or turned; else doubt their kind. What only all files together tell is settled
-    for each before: ``levels`` and ``ends`` of ``SensedDepth``.
+    depths are in another unit, in none that images share, or turned; else doubt their kind. What only all
+    files together tell is settled for each before: ``levels`` and ``ends`` of ``SensedDepth``.
 
     Args:
         frames: in the order of time; some of those with depth are read.
@@ -268,6 +271,7 @@ def doubt_depths(
         unit: what to do with the number that is the unit, ``set data.depth_scale={}``.
         far_key: what to do where far is wrong.
         usual: the kind if none was typed: axis, as of films, or ray, as of images from all around.
+        stretched: what to do with depths that were stretched to a range, each image by itself.
 
     Raises:
         SceneError: as ``doubt_kind``.
@@ -276,6 +280,8 @@ def doubt_depths(
     _settle_levels([frame.load_sensed for frame in frames])
     if kind not in (*METRIC, None) or not frames:
         return []
+    if how := _apart([frame.load_sensed for frame in frames]):
+        return [f"{where}: depths of different images seem to have different units, as {how}; {stretched}"]
     limits = _settle_ends([frame.load_sensed for frame in frames], where)
     loads = [frames[i].load_sensed for i in spread(len(frames), _LOOKED_AT)]
     near, far = loads[0].camera.near / world, loads[0].camera.far / world
@@ -313,6 +319,40 @@ def doubt_depths(
     if doubt := _doubt_colors(frames, groups, world, where, unit, usual):
         return lines + doubt
     return lines + doubt_kind(groups, loads[0].known, kind, where, usual)
+
+
+def _apart(loads: Sequence[SensedDepth]) -> str:
+    """Say by what depths are told to have been stretched to a range, each image by itself; nothing where they
+    seem not to be.
+    """
+    some = [loads[i] for i in spread(len(loads), _TRUSTED)]
+    tops = [_end_of_range(_numbers_in(load.path)) for load in some]
+    if len(tops) >= _FITTED and None not in tops:
+        return f"the largest number of each is {max(tops):.6g}, of few pixels"
+    if some[0].known is None or _told_by_points(some, 1.0) is not None:
+        return ""
+    fits = []
+    for load in some:
+        values, true = load.at_known(read_depth(load.path))
+        fits.append(line_through(values[values > 0], true[values > 0]))
+    if len(fits) < _FITTED or None in fits:
+        return ""
+    return "points that never move fit each with another scale or shift"
+
+
+def _end_of_range(values: np.ndarray) -> float | None:
+    """Return the largest of depths (H, W) if it is the end of a range to which these were stretched; None if
+    it is not, or of many pixels, or far above all others, as a number for no depth.
+    """
+    with np.errstate(invalid="ignore"):
+        values = values[np.isfinite(values)].astype(np.float64) if values.dtype.kind == "f" else values
+    if not values.size:
+        return None
+    top, is_real = values.max(), values.dtype.kind == "f"
+    ends = _ENDS if is_real else (np.iinfo(values.dtype).max, np.iinfo(values.dtype).max - 1)  # of truncation
+    others = values[values < top]
+    are_few = len(values.ravel()) - len(others) < max(_SEVERAL, _REPEATED * values.size)
+    return float(top) if top in ends and are_few and others.max(initial=0) > (1 - _GAP) * top else None
 
 
 def _settle_levels(loads: Sequence[SensedDepth]) -> None:
@@ -647,6 +687,12 @@ def unit_of(paths: Sequence[Path], near: float, far: float) -> tuple[float, list
         if near / _BEYOND <= unit * median <= _BEYOND * far:
             line = "depths are taken for thousandths of the cameras' unit, as near and far say"
             return unit, [] if unit == 1 else [f"{paths[0].parent}: {line}"]
+    ends = [_end_of_range(_numbers_in(paths[i])) for i in spread(len(paths), _LOOKED_AT)]
+    if len(ends) >= _FITTED and None not in ends:
+        got = (
+            f"ones of which the largest of each image is {max(ends):.6g}, as if each was stretched to a range"
+        )
+        raise mismatch(paths[0].parent, "depths of one unit", got, "write them so, or set data.depth=null")
     expected = f"depths between near and far, {near:.4g} and {far:.4g} in the cameras' unit, or thousandths"
     advice = f"multiply them by {fitting_unit(median, near, far)}"
     raise mismatch(paths[0].parent, expected, f"{median:.4g} in the median", advice)

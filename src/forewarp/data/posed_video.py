@@ -278,7 +278,9 @@ def read_scene(
 
     train, val, test = (tuple(map(frame, parts[split])) for split in SPLITS)
     refuse_copied_poses((*train, *val, *test), file)
-    assumed += doubt_depths(train, space.scale, depth_kind, place or file, "set data.depth_scale={}")
+    fits = f"set data.depth_kind=relative, or inverse if it is 1 / depth, which fits each to {POINTS}"
+    keys = {"unit": "set data.depth_scale={}", "stretched": f"{fits}, or data.depth=off to do without"}
+    assumed += doubt_depths(train, space.scale, depth_kind, place or file, **keys)
     ranks = {time: n for n, time in enumerate(sorted({*times}))}
     moments = {e.name: ranks[e.time] if e.moment is None else e.moment for e in entries}
     held = held_cameras(test_cameras, views, []), held_moments(test_moments, max(moments.values()) + 1)
