@@ -1,4 +1,4 @@
-"""``python -m tests.bench.viewer RUN [RUN ...]``: what the viewer shows a second, into docs/viewer.md.
+"""``python -m tests.bench.viewer RUN [RUN ...]``: exact images a second, into docs/results/performance.md.
 
 Takes finished runs, of one method each. The page is measured in a headless browser without a graphics
 card, with the first run whose particles it can draw. ``--print`` leaves the document as it is.
@@ -138,7 +138,7 @@ def main() -> None:
     quiet()
     reads = argparse.ArgumentParser(prog="python -m tests.bench.viewer", description=__doc__)
     reads.add_argument("runs", nargs="+", type=Path)
-    reads.add_argument("--print", action="store_true", help="leave docs/viewer.md as it is")
+    reads.add_argument("--print", action="store_true", help="leave docs/results/performance.md as it is")
     given = reads.parse_args()
     viewers = [viewer_of(run) for run in given.runs]
     exact = exact_table(viewers)
@@ -146,7 +146,7 @@ def main() -> None:
     tables = {"exact pictures": exact} | ({"the page": page_table(drawable[0])} if drawable else {})
     if not given.print:
         for name, text in tables.items():
-            replace_section(project_root() / "docs" / "viewer.md", name, text)
+            replace_section(project_root() / "docs" / "results" / "performance.md", name, text)
 
 
 if __name__ == "__main__":
