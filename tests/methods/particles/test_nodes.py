@@ -68,24 +68,6 @@ def test_gradients_of_curves_are_those_of_autograd(kind, straight, rotates):
         torch.testing.assert_close(found[name], parameter.grad, atol=1e-5, rtol=1e-3)
 
 
-@pytest.mark.parametrize(("kind", "rotates"), [("spline", True), ("spline", False), ("cosines", True)])
-def test_the_pull_to_rest_is_that_of_autograd_and_does_not_grow_with_distance(kind, rotates):
-    nodes = nodes_of(kind=kind, rotates=rotates)
-    for time in (0.2, 0.0, 1.0):
-        nodes.extend(time)
-    motion = nodes.motion_and_maps(nodes.curve(0.5))[0].detach().requires_grad_()
-    times = torch.linspace(0.0, 1.0, 16).tolist()
-    mean = sum(nodes.motion_and_maps(nodes.curve(time))[0].detach() for time in times) / 16
-    away = [(motion - mean)[:, :3] / 2.0, nodes.spacing[:, None] * (motion - mean)[:, 3:]]
-    sizes = [(d.square().sum(-1) + 3e-3**2).sqrt().mean() for d in away[: 1 + rotates]]
-    (5.0 * sum(sizes)).backward()
-    found, value = nodes.pull_to_rest(motion.detach(), 5.0, 2.0)
-    torch.testing.assert_close(found, motion.grad, atol=1e-6, rtol=1e-4)
-    assert value == pytest.approx(sum(size.item() - 3e-3 for size in sizes), rel=1e-4)
-    farther, _ = nodes.pull_to_rest(mean + 100 * (motion.detach() - mean), 5.0, 2.0)
-    assert float(farther[:, :3].norm(dim=-1).max()) <= 5.0 / 2.0 / 12 * (1 + 1e-5)
-
-
 @pytest.mark.parametrize(("straight", "known"), [(False, 5), (True, 4)])
 def test_a_curve_is_continued_to_times_not_yet_seen_but_not_anew(straight, known):
     nodes = nodes_of(knots=10, straight=straight)

@@ -71,22 +71,27 @@ class Deformation(nn.Module):
         return NodesNow(time, motion_time, basis, *nodes.carried(time, basis))
 
     def gradients(
-        self, now: NodesNow, by_maps: Tensor, factors: Mapping[str, float], extent: float
+        self,
+        now: NodesNow,
+        by_maps: Tensor,
+        factors: Mapping[str, float],
+        extent: float,
+        more_by_motion: Tensor | None = None,
     ) -> tuple[dict[str, float], dict[str, Tensor]]:
-        """Return the terms of motion, and gradients by the nodes' parameters of them and of the image.
+        """Return the terms ``rigid`` and ``smooth``, and gradients by the nodes' parameters of both and of an
+        image's loss, in one pass back from maps to curves.
 
         Args:
             now: nodes as the image shows them.
             by_maps: gradients (M, 12) of the image's loss by ``now.maps``.
             factors: weights of the terms.
             extent: of the scene, world units.
+            more_by_motion: gradients by ``now.motion`` of other terms; None: there are none.
         """
         nodes, terms = self.nodes, {}
         edges, rigid = (nodes.edges, nodes.edge_weights), factors.get("rigid", 0.0)
         by_motion, terms["rigid"] = pull_nodes(now.motion, nodes.positions, by_maps, *edges, rigid)
-        if "static" in factors:
-            to_rest, terms["static"] = nodes.pull_to_rest(now.motion, factors["static"], extent)
-            by_motion = by_motion + to_rest
+        by_motion = by_motion if more_by_motion is None else by_motion + more_by_motion
         smooth = factors.get("smooth", 0.0)
         terms["smooth"], gradients = nodes.backward(
             now.time, now.motion_time, now.basis, by_motion, smooth, extent

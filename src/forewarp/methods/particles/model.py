@@ -7,6 +7,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -23,6 +24,7 @@ from forewarp.methods.particles.follow import follow, put_on_ground
 from forewarp.methods.particles.gaussians import GaussianModel, coefficients
 from forewarp.methods.particles.nodes import Nodes, Skinning, TimeOffsets, are_rows
 from forewarp.methods.particles.options import EFFECTS, SMALLEST, Effects, Numbers, view_share
+from forewarp.methods.particles.regularizers import REGULARIZERS, Regularized, Regularizer, regularize
 from forewarp.methods.particles.start import at_rest, compile_kernels, first_values, fresh_values
 from forewarp.methods.particles.windows import begin_window, check_still
 from forewarp.methods.rows import RowsAdam, keep_rows, take_rows
@@ -73,7 +75,8 @@ class Particles(Method):
         choices: see ``options.Effects``.
     """
 
-    terms = ("photo", *IMAGE_LOSSES, "depth", "rigid", "smooth", "static")
+    regularizers: ClassVar[Mapping[str, Regularizer]] = REGULARIZERS
+    terms = ("photo", *IMAGE_LOSSES, "depth", "rigid", "smooth", *REGULARIZERS)
     numbers = tuple(key for key in Numbers.__dataclass_fields__ if key != "name")
     asks = Asks(kind="pictures", straight=True)
     loose = tuple(f"deformation.skinning.{name}" for name in Skinning.ROWS)  # few nodes: fewer links
@@ -305,15 +308,13 @@ class Particles(Method):
             count = len(seen.view) if seen.valid is None else int(seen.valid.sum())
             squared, numbers = squared + squared_error, numbers + 3 * count
             for name, value in of_image.items():
-                terms[name] += value / views
+                terms[name] = None if value is None else terms[name] + value / views
             has_depth |= seen.sensed is not None
             for name, value in found.items():
                 gradients[name] = gradients[name] + value if name in gradients else value
-        values = {name: (lambda v=v: self.gaussians.means.new_tensor(v)) for name, v in terms.items()}
-        if not has_depth:
-            values["depth"] = lambda: None
-        if self.deformation is None:
-            values |= dict.fromkeys(("rigid", "smooth", "static"), lambda: None)
+        terms["depth"] = terms["depth"] if has_depth else None
+        like = self.gaussians.means
+        values = {n: (lambda v=v: None if v is None else like.new_tensor(v)) for n, v in terms.items()}
         error = torch.tensor(squared / numbers, dtype=torch.float64)
         return Step(values, error, {"particles": len(self.gaussians)}, gradients)
 
@@ -338,11 +339,12 @@ class Particles(Method):
         generator: torch.Generator,
         views: int,
         covered: float,
-    ) -> tuple[float, dict[str, float], dict[str, Tensor]]:
+    ) -> tuple[float, dict[str, float | None], dict[str, Tensor]]:
         """Compare with one of a step's images, of which ``covered`` pixels show anything.
 
         Returns:
-            the sum of squared errors; the terms; and the step's gradients, by parameter.
+            the sum of squared errors; the terms, None where an effect is off; and the step's gradients, by
+            parameter.
         """
         time, gaussians = self._jittered(seen.moment.time, generator), self.gaussians
         deformation, now = self.deformation, None
@@ -367,20 +369,30 @@ class Particles(Method):
         self.density.mark_too_near(self.progress, compared.order, compared.distances)
         gradients, found = {}, compared.particles
         if light is not None:
-            unlit, drift = (
-                [getattr(gaussians, n) for n in gaussians.color_names],
-                self._drift(seen.moment.time),
-            )
+            unlit = [getattr(gaussians, name) for name in gaussians.color_names]
+            drift = self._drift(seen.moment.time)
             by_kind, gradients["exposure"] = exposure.to_unlit(unlit, found.colors, light, drift)
             found = found._replace(colors=by_kind)
         gradients |= {f"gaussians.{name}": value for name, value in gaussians.split(found).items()}
-        if now is not None:
+        extent = float(self.extent)
+        values, by_motion, by_name = regularize(
+            {name: function for name, function in self.regularizers.items() if name in factors},
+            factors,
+            Regularized(gaussians, deformation, None if now is None else now.motion, extent),
+            self.named_parameters(),
+        )
+        terms |= values
+        if now is None:
+            terms |= {"rigid": None, "smooth": None}
+        else:
             rigid = factors.get("rigid", 0.0) * self.stage.rigid_final_factor**self.progress
-            factors, extent = dict(factors) | {"rigid": rigid}, float(self.extent)
-            of_motion, by_nodes = deformation.gradients(now, compared.maps, factors, extent)
+            factors = dict(factors) | {"rigid": rigid}
+            of_motion, by_nodes = deformation.gradients(now, compared.maps, factors, extent, by_motion)
             terms |= of_motion
             by_nodes["skinning.logits"] = compared.skin
             gradients |= {f"deformation.{name}": value for name, value in by_nodes.items()}
+        for name, gradient in by_name.items():
+            gradients[name] = gradients[name] + gradient if name in gradients else gradient
         if fixed is not None:
             for name in gradients.keys() & {*self.grows}:
                 gradients[name][fixed] = 0.0  # the optimiser passes over them

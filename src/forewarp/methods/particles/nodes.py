@@ -20,7 +20,6 @@ _HALF_STEP = 1e-3  # of all time: for central differences by time
 _FULL = 0.05  # share of a spline's basis at a time, from which on its knot counts as seen
 _FARTHEST = 0.2  # of all time: no image's time is off by more
 _BEYOND = _FARTHEST + 2 * _HALF_STEP  # of all time, by which a curve must reach beyond [0, 1]
-_REST = 3e-3  # share of a unit below which nodes are pulled to rest with less than full force
 _REST_TIMES = 16  # over which a node's mean place is taken
 _FEWEST = 20  # nodes of a body
 _LOOSE = 1e-4  # how much curves are kept small where they take over from bodies
@@ -241,18 +240,19 @@ class Nodes(nn.Module):
         """Return how far each node takes what is beside it (M,) from its mean place, world units."""
         bases = torch.stack([self.basis(time) for time in times])
         distance = torch.zeros_like(self.spacing)
-        for value, arm in zip(self._coefficients(), self._arms()):
+        for value, arm in zip(self._coefficients(), self.arms()):
             went = torch.einsum("mkc,tk->tmc", value, bases)
             distance += arm * (went - went.mean(0)).norm(dim=-1).amax(0)
         return distance
 
-    def _arms(self) -> tuple[float, Tensor]:
-        """Return the factors by which translations, and rotations (M,), become distances.
+    def arms(self) -> list[Tensor]:
+        """Return the factors (M,) by which translations, and rotations if there are any, become distances.
 
         A Gibbs vector, and the first three numbers of a quaternion, is half a small angle; what rotates lies
         about ``spacing`` from the node.
         """
-        return 1.0, 2 * self.spacing
+        arms = [torch.ones_like(self.spacing), 2 * self.spacing]
+        return arms[: len(self._coefficients())]
 
     @torch.no_grad()
     def stop(self, which: Tensor, times: list[float]) -> None:
@@ -312,30 +312,9 @@ class Nodes(nn.Module):
         return bent, {name: value for name, value in zip(names, gradients) if value is not None}
 
     @torch.no_grad()
-    def pull_to_rest(self, motion: Tensor, factor: float, unit: float) -> tuple[Tensor, float]:
-        """Pull nodes to where they are on average over the times seen, by a force that does not grow with
-        their distance: it holds what images say little about, and gives way where they say more.
-
-        Added to the loss is, once for translations and once for rotations, ``factor`` times the mean over
-        nodes of ``sqrt(d^2 + e^2) - e``: e = 0.003, d how far a node is from its mean place, or how far its
-        turning from the mean takes what is beside it, over ``unit``. The mean counts as constant.
-
-        Args:
-            motion: (M, 6 or 7) at a time, of ``motion_and_maps``.
-            factor: weight.
-            unit: a length, world units.
-
-        Returns:
-            gradients, of the shape of ``motion``; and the sum of both means.
-        """
-        gradients, value, mean = torch.zeros_like(motion), 0.0, self._mean_basis().to(motion)
-        for coefficients, arm, part in zip(self._coefficients(), self._arms(), (slice(3), slice(3, 7))):
-            by_unit = torch.as_tensor(arm, device=motion.device).reshape(-1, 1) / unit
-            away = by_unit * (motion[:, part] - torch.einsum("mkc,k->mc", coefficients, mean))
-            size = (away.square().sum(-1, keepdim=True) + _REST**2).sqrt()
-            gradients[:, part] = factor * by_unit * away / size / len(motion)
-            value += float(size.mean()) - _REST
-        return gradients, value
+    def mean_motion(self) -> Tensor:
+        """Return the motion (M, 6 or 7), averaged over the times seen."""
+        return self.motion_and_maps(self._mean_basis())[0]
 
     def _mean_basis(self) -> Tensor:
         """Return the curve's basis (K,), averaged over the times of the motion that were seen."""
@@ -343,7 +322,7 @@ class Nodes(nn.Module):
         if self._averaged is None or self._averaged[0] != span:  # they grow as times come in
             times = torch.linspace(*span, _REST_TIMES).tolist()
             self._averaged = span, self.summed_basis(*((time, 1 / _REST_TIMES) for time in times))
-        return self._averaged[1]
+        return self._averaged[1].to(self.positions)
 
     def _second_difference(self, motion_time: float) -> Tensor:
         """Return the second difference (K,) of the basis around a time of the motion, within those seen."""
