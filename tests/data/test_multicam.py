@@ -13,9 +13,10 @@ from forewarp.data.films import STORE
 from forewarp.data.images import CACHE, write_image
 from forewarp.data.module import MulticamDataModule
 from forewarp.data.multicam import FILE, read_scene, write_poses
-from forewarp.data.rigs import held_cameras
+from forewarp.data.rigs import held_cameras, refuse_copied_poses
 from forewarp.scene.box import Box
 from forewarp.scene.camera import Camera
+from forewarp.scene.frame import Frame
 from tests.support.films import numbered, write_film
 from tests.support.written_scenes import fixed_cameras, grey, placed, refused, say_linear, write_multicam
 
@@ -383,6 +384,18 @@ def test_a_camera_that_counts_from_another_number_is_named(folder):
         path.rename(path.with_name(f"{int(path.stem) + 1:04d}.png"))
     with refused("if only its count begins at another number, rename its frames by -1; else remove a frame"):
         read_scene(folder.parent, "toy")
+
+
+def test_copied_poses_are_of_images_that_differ_in_two_folders_or_of_two_cameras():
+    def frame(name, bright, camera_id=None):
+        pixels = torch.full((32, 48, 4), bright, dtype=torch.uint8)
+        return Frame(name, 0.5, CAMERAS[0], lambda: pixels, camera_id=camera_id)
+
+    for other in (frame("a/2", 90), frame("b/1", 9), replace(frame("b/1", 90), time=0.6)):
+        refuse_copied_poses([frame("a/1", 9), other], "toy")
+    for pair in ([frame("a/1", 9), frame("b/1", 90)], [frame("a/1", 9, 0), frame("a/2", 90, 1)]):
+        with refused(f"toy: expected a pose for each camera, but got one for a/1 and {pair[1].name}, whose"):
+            refuse_copied_poses(pair, "toy")
 
 
 def test_rows_without_the_turn_of_llff_are_named(tmp_path):

@@ -91,7 +91,7 @@ def refuse_copied_poses(frames: Iterable[Frame], where: object) -> None:
     """Refuse two cameras of just one pose whose images of one time differ.
 
     Args:
-        frames: of a rig; others have no ``camera_id`` and are not looked at.
+        frames: of a rig; without ``camera_id`` folders of images tell cameras.
         where: what poses belong to.
 
     Raises:
@@ -100,10 +100,14 @@ def refuse_copied_poses(frames: Iterable[Frame], where: object) -> None:
     Cost: two images are decoded where poses are one.
     """
     first: dict[tuple, Frame] = {}
-    for frame in (frame for frame in frames if frame.camera_id is not None):
+
+    def taker(frame: Frame) -> object:
+        return frame.name.rpartition("/")[0] if frame.camera_id is None else frame.camera_id
+
+    for frame in frames:
         pose = frame.camera.camera_to_world
         other = first.setdefault((frame.time, frame.camera.inner, tuple(pose.flatten().tolist())), frame)
-        if frame.camera_id == other.camera_id:
+        if taker(frame) == taker(other):
             continue
         one, two = (small_image(each.load()) for each in (other, frame))
         if float((one - two).abs().mean()) > _DIFFER:
