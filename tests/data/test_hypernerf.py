@@ -109,6 +109,22 @@ def test_time_id_counts_before_warp_id_and_entries_of_no_item_not_at_all(tmp_pat
     assert read_scene(tmp_path, "toy").test[0].time == 0.25
 
 
+@pytest.mark.parametrize("told", [True, False])
+def test_names_of_numbers_alone_tell_moments_where_camera_id_tells_cameras(tmp_path, told):
+    shots = [replace(shot, name=f"{shot.camera_id}_{shot.time_id:05d}") for shot in rig()]
+    file = write_rig(tmp_path / "toy", shots) / "metadata.json"
+    numbers = {shot.name: shot.time_id for shot in shots}
+    counted = {name: i for i, name in enumerate(sorted(numbers))}
+    edit(file, lambda c: [(e.pop("time_id"), e.update(camera_id=e["camera_id"] * told)) for e in c.values()])
+    assert "assumed" not in read_scene(tmp_path, "toy").protocol
+    edit(file, lambda c: [e.update(warp_id=counted[name]) for name, e in c.items()])
+    scene, used = read_scene(tmp_path, "toy"), numbers if told else counted
+    times = {f.name: f.time for f in (*scene.train, *scene.test)}
+    assert times == pytest.approx({name: used[name] / max(used.values()) for name in times})
+    (line,) = scene.protocol["assumed"]
+    assert ("times are these" if told else "give items of one moment one time_id") in line
+
+
 def test_names_tell_the_moment_where_warp_id_counts_one_camera_after_the_other(tmp_path):
     file = write_rig(tmp_path / "toy", rig()) / "metadata.json"
     expected = {f.name: f.time for f in (lambda s: (*s.train, *s.test))(read_scene(tmp_path, "toy"))}

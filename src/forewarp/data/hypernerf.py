@@ -104,6 +104,7 @@ _LENS_KEYS = (
     "tangential_distortion",
 )
 _LIKE_FOCAL = re.compile("(?i)f_?[xy]|fl_?[xy]|focal.*|(pixel_?)?aspect.*")
+_LAST_NUMBER = re.compile(r"(.*?)(\d+)\D*")  # of an item's name, and what is before it
 _EVERY = 4  # the published interpolation protocol: train on every fourth, test midway between
 
 
@@ -579,17 +580,22 @@ def _read_items(path: Path, ids: list[str]) -> tuple[dict[str, int], dict[str, i
     moments, cameras = {item: counted(entry, key) for item, entry in entries.items()}, dict.fromkeys(ids)
     having = {item: entry for item, entry in entries.items() if entry.get("camera_id") is not None}
     cameras |= {item: counted(entry, "camera_id") for item, entry in having.items()}
-    read = None
-    with suppress(SceneError):  # names that do not tell are no help
-        read = read_names(ids, str(path))
-    named, views = dict(zip(ids, read.frames)) if read else {}, cameras
-    if read and read.cameras and len({*cameras.values()}) == 1:  # a number that says nothing
-        order = in_order({*read.cameras})
-        views = {item: order.index(camera) for item, camera in zip(ids, read.cameras)}
+    frames, takers, is_sure = [], None, True
+    with suppress(SceneError):  # names of numbers alone tell only with camera_id
+        if (read := read_names(ids, str(path))) is not None:
+            frames, takers = read.frames, read.cameras
+    if not frames and all(ends := [_LAST_NUMBER.fullmatch(item) for item in ids]):
+        takers, frames = [end[1] for end in ends], [float(end[2]) for end in ends]
+        pairs = {*zip(takers, cameras.values())}
+        is_sure = len(pairs) == len({*takers}) == len({*cameras.values()})
+    named, views = dict(zip(ids, frames)), cameras
+    if takers and len({*cameras.values()}) == 1:  # a number that says nothing
+        order = in_order({*takers})
+        views = {item: order.index(camera) for item, camera in zip(ids, takers)}
     if not _counts_items(moments, named, views):
         return moments, cameras, []
     line = f"{path}: {key} counts the items in another order than the numbers in their names"
-    if key == "time_id":
+    if key == "time_id" or not is_sure:
         return moments, cameras, [f"{line}; if cameras film at once, give items of one moment one time_id"]
     return named, views, [f"{line}: times are these numbers; write time_id if they are wrong"]
 
