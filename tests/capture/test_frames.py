@@ -25,7 +25,7 @@ from forewarp.capture.frames import (
 from forewarp.capture.poses import BLURRED
 from tests.support.captures import quiet, step
 from tests.support.films import numbered, write_film, write_planes
-from tests.support.written_scenes import refused
+from tests.support.written_scenes import refused, say_linear
 
 
 def stamps_of(film):
@@ -232,7 +232,9 @@ def test_black_bars_are_cut_off_and_told(tmp_path, rotation):
     pictures = tmp_path / "p"
     pictures.mkdir()
     for i in (0, 4, 8):
-        Image.fromarray(np.pad(frames[i], ((0, 0), (20, 20), (0, 0)))).save(pictures / f"{i}.png")
+        Image.fromarray(np.pad(frames[i] + np.uint8(i), ((0, 0), (20, 20), (0, 0)))).save(
+            pictures / f"{i}.png"
+        )
     told = take(tmp_path, Source(images=pictures), step, None, None)
     bars, times = told.assumed.split("; ", 1)
     assert bars == "black bars, 12% at the left and right each, stay: crop the pictures"
@@ -240,6 +242,18 @@ def test_black_bars_are_cut_off_and_told(tmp_path, rotation):
     pixels = np.asarray(Image.open(images.folder / next(iter(images.times))))[..., 0]
     assert pixels.max(1).min() > 150
     assert pixels.max(0).min() > 150
+
+
+def test_linear_and_equal_images_of_a_folder_are_told(tmp_path):
+    pictures = tmp_path / "p"
+    pictures.mkdir()
+    for i, frame in enumerate(numbered(4)):
+        Image.fromarray(frame).save(pictures / f"{i}.png")
+    shutil.copy(pictures / "0.png", pictures / "1.png")
+    say_linear(pictures / "3.png")
+    told = take(tmp_path, Source(images=pictures), step, None, None).assumed
+    assert "1 of 4 images say that they are linear (gAMA 1; 3.png, ..)" in told
+    assert f"{pictures}: 1 of 4 images are the same file as others (0.png and 1.png, ..); leave" in told
 
 
 @pytest.mark.parametrize("frame", ["dark above", "uneven", "soft"])

@@ -29,7 +29,16 @@ from forewarp.data.files import (
     way_from,
     way_from_file,
 )
-from forewarp.data.images import bright, by, common_header, read_image, write_image
+from forewarp.data.images import (
+    bright,
+    by,
+    common_header,
+    copies,
+    exif_turned,
+    mixed_linear,
+    read_image,
+    write_image,
+)
 from forewarp.data.names import in_order, read_names
 from forewarp.data.video import Log, converted, decode, deinterlacing, doubts_of, extracted
 from forewarp.drawing.images import at_most
@@ -261,7 +270,10 @@ def _from_folder(folder: Path, source: Source, step: Step) -> dict:
     if read is not None and (as_stored or len({*read.frames}) == len(paths)):
         numbers, assumed = dict(zip(paths, read.times)), f"{where}: times: {read.how}"
         paths.sort(key=numbers.get)
-    has_alpha = common_header(paths, one_size=not as_stored).has_alpha
+    common, headers = common_header(paths, one_size=not as_stored)
+    has_alpha, turned = common.has_alpha, [path for path in paths if as_stored and headers[path].is_turned]
+    told += mixed_linear(headers, where) + [f"{where}: {line}" for line in copies(paths)]
+    told += exif_turned(turned, where)
     widths, originals, sizes, times, first, brightest = [], {}, {}, {}, None, 0
     with step("reading pictures") as progress:
         for done, path in enumerate(paths, 1):

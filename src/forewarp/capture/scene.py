@@ -153,7 +153,7 @@ def write(
     paths, cameras = [frames.folder / name for name in names], [found.cameras[name] for name in names]
     times, sizes = [frames.times[name] for name in names], [(c.width, c.height) for c in cameras]
     scales = [s for s in SCALES[1:] if min(map(min, sizes)) // s >= _MIN_SIDE]
-    has_alpha = common_header(paths, one_size=False).has_alpha
+    has_alpha = common_header(paths, one_size=False)[0].has_alpha
     is_film = not frames.cameras and len({*times}) == len(names) and len({*sizes}) == 1
     masks, moving_from, share = [None] * len(names), None, 0.0
     if frames.masks is not None:

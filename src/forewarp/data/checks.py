@@ -14,7 +14,7 @@ from forewarp.data.agreement import BESIDE, COMPARED, likeliest, silhouette_erro
 from forewarp.data.cameras import IN_PIXELS, WIDEST, degrees_of, nine_pixels
 from forewarp.data.directions import common_point, readings_of
 from forewarp.data.files import SceneError, mismatch
-from forewarp.data.images import by
+from forewarp.data.images import StoredImage, by, copies
 from forewarp.data.names import hexadecimal, in_order, read_names
 from forewarp.data.paths import doubt_paths
 from forewarp.scene.box import Box, Lattice
@@ -81,6 +81,11 @@ def remarks(scene: Scene) -> Iterator[str]:
         line = f"times follow the images' names as texts, not their numbers ({got} comes where {due} is due)"
         yield f"{line}; count them in the order of the numbers"
     yield from doubt_paths(scene)
+    trained, tested = (
+        [frame.load.path for frame in frames if isinstance(frame.load, StoredImage)]
+        for frames in ((*scene.train, *scene.held), scene.test)
+    )
+    yield from copies([*dict.fromkeys((*trained, *tested))], {*tested} - {*trained})
     first, last = scene.times[0], scene.times[-1]
     beyond = [frame.time for frame in scene.test if not first <= frame.time <= last]
     if scene.test and len(beyond) == len(scene.test):

@@ -7,9 +7,10 @@ import mmap
 import os
 import weakref
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from hashlib import sha256
 from pathlib import Path
 from typing import BinaryIO
 
@@ -184,8 +185,37 @@ def mixed_linear(headers: Mapping[Path, Header], where: object) -> list[str]:
     return [f"{where}: {line}, and all are read as sRGB; write all alike"]
 
 
-def common_header(paths: Iterable[Path], one_size: bool = True) -> Header:
+def same_files(paths: Iterable[Path]) -> list[list[Path]]:
+    """Group files that are the same byte for byte, in the order given; a file without a copy is left out.
+
+    Cost: one look at the size of each, one read of those that share it.
+    """
+    of_size: dict[int, list[Path]] = {}
+    for path in dict.fromkeys(paths):
+        of_size.setdefault(path.stat().st_size, []).append(path)
+    same: dict[bytes, list[Path]] = {}
+    for path in (path for some in of_size.values() if len(some) > 1 for path in some):
+        same.setdefault(sha256(read_bytes(path, MOST_IMAGE, "an image")).digest(), []).append(path)
+    return [some for some in same.values() if len(some) > 1]
+
+
+def copies(paths: Sequence[Path], tested: Collection[Path] = ()) -> list[str]:
+    """Say in a line that some images are copies of others, and how many are so that are ``tested`` on."""
+    if not (groups := same_files(paths)):
+        return []
+    count, (one, other) = sum(map(len, groups)) - len(groups), groups[0][:2]
+    line = f"{count} of {len(paths)} images are the same file as others ({one.name} and {other.name}, ..)"
+    both = sum(path in tested for some in groups if not {*some} <= {*tested} for path in some)
+    if both:
+        return [f"{line}; {both} to test on are trained on, too: their scores say little"]
+    return [f"{line}; leave them out, unless nothing moved meanwhile"]
+
+
+def common_header(paths: Iterable[Path], one_size: bool = True) -> tuple[Header, dict[Path, Header]]:
     """Check images that must have one size, unless ``one_size`` is false; alpha where all of them have it.
+
+    Returns:
+        what they have in common, and the header of each.
 
     Raises:
         SceneError: as ``inspect_image``, and where one differs in size from most.
@@ -195,7 +225,7 @@ def common_header(paths: Iterable[Path], one_size: bool = True) -> Header:
     for path, header in headers.items() if one_size else ():
         if header.size != size:
             raise wrong_size(path, size, header.size, " as most", "remove it")
-    return Header(size, all(header.has_alpha for header in headers.values()))
+    return Header(size, all(header.has_alpha for header in headers.values())), headers
 
 
 def read_image(path: Path, size: tuple[int, int] | None = None, *, upright: bool = False) -> Tensor:
