@@ -125,7 +125,7 @@ def run_of(size: Size, steps: int, folder: Path, effects: Sequence[str] = ()) ->
     nodes = size.nodes / math.sqrt(size.particles)
     config = composed(
         "model=particles", "trainer=cpu", "~stage.coarse", "callbacks.pictures=null", f"run={folder}",
-        "budget.minutes=null", f"budget.iterations={steps}", f"stage.fine.deformation.nodes={nodes}",
+        "budget.minutes=null", f"budget.iterations={steps}", f"stage.fine.nodes={nodes}",
         "stage.fine.initial_share=1.0", "stage.fine.density_interval=1.0", "stage.fine.density=1000",
         "stage.fine.crowd_decay=0.0", *effects,  # as hook, which has fewer particles than pixels
     )  # fmt: skip

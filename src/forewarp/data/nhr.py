@@ -307,7 +307,8 @@ def _refuse_order(path: Path, cameras: Sequence[Camera], masks: Sequence[Path], 
     size = [(camera.width, camera.height) for camera in cameras]
     shown = lru_cache(None)(lambda k: bright(masks[k], size[k]))
     some = spread(len(cameras), _COMPARED)
-    if sum(_missed(cameras[k], shown(k), points) for k in some) <= _MISSED * len(some):
+    share = sum(_missed(cameras[k], shown(k), points) for k in some) / len(some)
+    if not _MISSED < share < 1 - _MISSED:  # right, or masks that are inverted
         return
     from scipy.optimize import linear_sum_assignment  # late: it takes long, and hardly any scene needs it
 
@@ -315,7 +316,7 @@ def _refuse_order(path: Path, cameras: Sequence[Camera], masks: Sequence[Path], 
     for inner in (
         lambda k, row: k,
         lambda k, row: row,
-    ):  # rows of poses alone are in another order, or blocks, too
+    ):  # rows of poses alone in another order, or blocks, too
         missed = np.zeros((len(cameras), len(cameras)))
         for k, row in product(every, every):
             camera = replace(cameras[inner(k, row)], camera_to_world=cameras[row].camera_to_world)
