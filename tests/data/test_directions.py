@@ -9,6 +9,7 @@ from forewarp.data.directions import (
     by_translation,
     check_directions,
     closer_readings,
+    doubt_readings,
     inverted,
     opposite,
     other_readings,
@@ -106,6 +107,14 @@ def test_poses_that_meet_much_closer_in_another_way_are_doubted():
     assert other_readings(misread, {"t": by_translation}) == []
     assert closer_readings(misread, CHANGES | {"t": by_translation}) == ["t"]
     assert closer_readings(right, CHANGES | {"t": by_translation}) == []
+    (line,) = doubt_readings(misread, {"t": by_translation}, "camera", "write them anew")
+    assert (
+        line
+        == "camera: cameras look at about one thing, and 5 times closer or more if t; if so, write them anew"
+    )
+    (line,) = doubt_readings(opposite(right), CHANGES, "camera", "write them anew")
+    assert line.startswith("camera: cameras do not look at one thing, as all of them do if axes; if so")
+    assert doubt_readings(right, CHANGES, "camera", "") == []
     (line,) = check_directions(opposite(by_inverse(opposite(right))), "t.json", inverse=False)
     assert "look at about one thing, and 5 times closer or more if translations are of world-to" in line
 

@@ -90,8 +90,23 @@ def refuse_other_readings(
         raise mismatch(
             where, expected, f"cameras that look at one thing only if {', or if '.join(ways)}", advice
         )
-    ways = closer_readings(poses, changes)
-    return [f"{where}: {_BOTH.format(', or if '.join(ways))}; if so, {advice}"] if ways else []
+    return doubt_readings(poses, changes, where, advice)
+
+
+def doubt_readings(
+    poses: Sequence[torch.Tensor], changes: Mapping[str, _Change], where: object, advice: str
+) -> list[str]:
+    """Say in a line in which other ways poses make more sense.
+
+    Args:
+        poses, changes: see ``other_readings``.
+        where, advice: of the line.
+    """
+    said = "cameras do not look at one thing, as all of them do if {}"
+    ways = other_readings(poses, changes)
+    if not ways:
+        said, ways = _BOTH, closer_readings(poses, changes)
+    return [f"{where}: {said.format(', or if '.join(ways))}; if so, {advice}"] if ways else []
 
 
 def other_readings(poses: Sequence[torch.Tensor], changes: Mapping[str, _Change]) -> list[str]:

@@ -44,10 +44,9 @@ from forewarp.data.cameras import (
 from forewarp.data.depth import METRIC, SensedDepth, depths_beside, doubt_depths, unit_of
 from forewarp.data.directions import (
     by_translation,
-    closer_readings,
     common_point,
+    doubt_readings,
     opposite,
-    other_readings,
     transposed,
 )
 from forewarp.data.files import (
@@ -288,9 +287,7 @@ def read_scene(
         raise mismatch(world.where("center"), "the middle of what is filmed", got, "write that")
     if (line := _doubt_range(poses, size, near, far)) is not None:
         assumed.append(f"{world.file}: near, far: {line}")
-    if ways := other_readings(poses, _READINGS) or closer_readings(poses, _READINGS):
-        line = "cameras do not look at one thing, as all of them do if"
-        assumed.append(f"{folder / 'camera'}: {line} {', or if '.join(ways)}; if so, write them anew")
+    assumed += doubt_readings(poses, _READINGS, folder / "camera", "write them anew")
     has_masks = any(f.load_valid for f in train)
     protocol = {
         "dataset": "hypernerf" if depth is None else "iphone",
