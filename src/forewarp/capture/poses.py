@@ -204,15 +204,15 @@ def _stored(folder: Path, kind: str) -> pycolmap.Reconstruction:
     try:
         with memory_within(_ROOM + 20 * sum(file.stat().st_size for file in files)):  # it believes lengths
             (model.read_binary if kind == "bin" else model.read_text)(folder)
-    except (RuntimeError, ValueError, IndexError, OverflowError, MemoryError) as error:
+        if kind == "txt":  # of a name with blanks it took what is before the first
+            with files[1].open(encoding="utf-8", errors="replace") as lines:
+                rows = (line.split(maxsplit=9) for line in lines if line.strip() and line.lstrip()[0] != "#")
+                for row in rows:
+                    model.images[int(row[0])].name = row[9].rstrip()
+                    next(lines, None)  # its points, or an empty line
+    except (RuntimeError, ValueError, LookupError, OverflowError, MemoryError) as error:
         text = (str(error).strip().splitlines() or ["a file that cannot be read"])[-1]
         raise mismatch(folder, "a COLMAP model", text, "export it again") from error
-    if kind == "txt":  # of a name with blanks it took what is before the first
-        with files[1].open(encoding="utf-8", errors="replace") as lines:
-            rows = (line.split(maxsplit=9) for line in lines if line.strip() and line.lstrip()[0] != "#")
-            for row in rows:
-                model.images[int(row[0])].name = row[9].rstrip()
-                next(lines, None)  # its points, or an empty line
     return model
 
 
