@@ -20,9 +20,9 @@ def data():
 
 @pytest.fixture
 def truth(data, tmp_path):
-    """A folder with the true image of each test view, numbered."""
+    """A folder with an image nearly like the truth of each test view, numbered."""
     for i, target in enumerate(data.targets("test")):
-        write_png(tmp_path / "truth" / f"{i}.png", target.rgb)
+        write_png(tmp_path / "truth" / f"{i}.png", 0.97 * target.rgb)
     return tmp_path / "truth"
 
 
@@ -57,6 +57,20 @@ def test_another_order_is_refused(data, truth):
     check_renders(files, targets)
     with pytest.raises(SceneError, match="expected 2.png to show the test view t_0, but got an image of t_2"):
         check_renders(files[::-1], targets)
+
+
+@pytest.mark.parametrize(("kind", "split"), [("test", "test"), ("training", "train")])
+def test_the_images_of_the_scene_itself_are_refused(data, tmp_path, kind, split):
+    targets = data.targets("test")
+    names = [target.frame.name for target in data.targets(split)][: len(targets)]
+    files = [
+        write_png(tmp_path / "gt" / f"{name}.png", target.rgb)
+        for name, target in zip(names, data.targets(split))
+    ]
+    (tmp_path / "renders").mkdir()
+    got = rf"got the {kind} images themselves \({len(files)} of {len(files)}\); set renders=.*/renders"
+    with pytest.raises(SceneError, match=f"expected images of a method, but {got}"):
+        check_renders(files, targets, data.targets("train"))
 
 
 def test_images_that_are_all_alike_are_of_no_other_order(data, tmp_path):

@@ -40,6 +40,8 @@ _CLOSER = 1.5  # times as near: another view's truth is clearly more like an ima
 _MISPLACED = 0.5  # share of the views
 _MEASURED_BY = ("forewarp", "torchmetrics")  # whose versions count; others trained and rendered
 _FAR, _NEAR = 0.25, 0.1  # mean difference of colours: another background, this background
+_ROUNDING = 1.01 / 255  # of any pixel: what writing an image and reading it again may change
+_COPIED = 0.5  # share of the views
 
 
 def measure_elsewhere(config: DictConfig) -> dict:
@@ -76,7 +78,7 @@ def measure_elsewhere(config: DictConfig) -> dict:
     protocol = {key: value for key, value in given.items() if value is not None}
     mask_box = datamodule.scene.protocol.get("mask_box", False)
     suite = ImageSuite(find_lpips(extra=config.lpips_weights), mask_box=mask_box)
-    files = matched(datamodule.targets("test"), renders, config.views)
+    files = matched(datamodule.targets("test"), renders, config.views, datamodule.targets("train"))
     options = {"protocol": protocol, "minutes": config.minutes, "sheets": config.sheets}
     with locked(folder), Counted("test views") as progress:
         metrics = measure_renders(datamodule, files, folder, suite, progress=progress, **options)
@@ -155,26 +157,42 @@ def read_render(file: Path, target: Target) -> Tensor:
     return image[..., :3] * alpha + (1 - alpha) * target.background.to(image)
 
 
-def check_renders(files: Sequence[Path], targets: Sequence[Target]) -> None:
-    """Refuse images that are clearly of the test views in another order, or on the other background.
+def check_renders(files: Sequence[Path], targets: Sequence[Target], trained: Sequence[Target] = ()) -> None:
+    """Refuse images that are clearly the scene's own, of the test views in another order, or on the other
+    background.
 
     An image is out of order if it is far more like the truth of another view than like its own, and no other
-    image is as like that truth; refused where this holds of half of the views.
+    image is as like that truth; refused where this holds of half of the views. It is the scene's own if no
+    pixel differs from its view's truth, or from the training view of its name, by more than rounding.
 
     Args:
         files: an image for each target.
         targets: test views.
+        trained: training views.
 
     Raises:
-        SceneError: naming an image and the view that it shows, or the key of the background.
+        SceneError: naming an image and the view that it shows, the key of the background, or what was given
+            in place of renders.
     """
-    shown, truths, behind = [], [], []
+    shown, truths, behind, copied = [], [], [], {"test": 0, "training": 0}
+    numbers = {PurePosixPath(frame.name).name: n for n, frame in enumerate(trained.frames)} if trained else {}
     for file, target in zip(files, targets):
         image = read_render(file, target)
+        if _is_copy(image, target):
+            copied["test"] += 1
+        elif (number := numbers.get(file.stem)) is not None:
+            copied["training"] += _is_copy(image, trained[number])
         shown.append(_averaged(image))
         truths.append(_averaged(target.rgb))
         if target.foreground is not None and not bool(target.foreground.all()):
             behind.append(image[~target.foreground].mean(0))
+    for kind, count in copied.items():
+        if count > _COPIED * len(shown):
+            got = f"the {kind} images themselves ({count} of {len(shown)})"
+            advice = "set renders= to the folder of its images, often called renders"
+            if (beside := files[0].parent.with_name("renders")).is_dir() and beside != files[0].parent:
+                advice = f"set renders={beside}"
+            raise mismatch(f"renders: {files[0].parent}", "images of a method", got, advice)
     if behind:
         _check_background(torch.stack(behind).mean(0), targets[0].background, files[0].parent)
     apart = torch.cdist(torch.stack(shown), torch.stack(truths)).square()
@@ -188,6 +206,13 @@ def check_renders(files: Sequence[Path], targets: Sequence[Target]) -> None:
         raise mismatch(files[i].parent, expected, got, "give images the names of their test views")
 
 
+def _is_copy(image: Tensor, target: Target) -> bool:
+    """Tell whether an image is a target's own; one of a single colour tells nothing."""
+    truth = target.rgb
+    is_plain = bool((truth == truth[0, 0]).all())
+    return not is_plain and image.shape == truth.shape and float((image - truth).abs().max()) <= _ROUNDING
+
+
 def _check_background(mean: Tensor, wanted: Tensor, folder: Path) -> None:
     named = {name: torch.tensor(color) for name, color in COLORS.items()}
     ours = next((name for name, color in named.items() if torch.equal(color, wanted.float())), "the same")
@@ -199,24 +224,27 @@ def _check_background(mean: Tensor, wanted: Tensor, folder: Path) -> None:
             )
 
 
-def matched(targets: Sequence[Target], renders: Path, views: int | None = None) -> dict[int, Path]:
+def matched(
+    targets: Sequence[Target], renders: Path, views: int | None = None, trained: Sequence[Target] = ()
+) -> dict[int, Path]:
     """Match the images of a folder to the test views to measure, and check them (``check_renders``).
 
     Args:
         targets: the test views.
         renders: folder of the images, see ``files_of``.
         views: most test views to measure, evenly spread; None: all.
+        trained: the training views.
 
     Returns:
         the image of each view to measure, by the view's index.
 
     Raises:
-        SceneError: for images of other views, sizes, orders or backgrounds.
+        SceneError: for images of other views, sizes, orders or backgrounds, and for the scene's own.
     """
     files = files_of(renders, [frame.name for frame in targets.frames])
     chosen = middles(len(targets), views)
     checked = [chosen[i] for i in spread(len(chosen), _CHECKED)]
-    check_renders([files[i] for i in checked], [targets[i] for i in checked])
+    check_renders([files[i] for i in checked], [targets[i] for i in checked], trained)
     return {number: files[number] for number in chosen}
 
 
