@@ -44,7 +44,29 @@ def test_the_very_files_are_as_published(tmp_path, dnerf):
     made = found(DNERF, tmp_path, dnerf[1])
     assert (made.state, made.is_complete) == (AS_PUBLISHED, True)
     assert made.words.endswith("images of 8 x 6, every byte")
-    assert found(DNERF, tmp_path / "dnerf", dnerf[1]).state == ABSENT
+
+
+@pytest.mark.parametrize(
+    ("place", "root", "says"),
+    [
+        ("dnerf/data/scene", ".", "found in dnerf/data/scene: move it to dnerf/scene"),
+        ("data/scene", ".", "found in data/scene: move it to dnerf/scene"),
+        ("dnerf/scene/scene", ".", "found in dnerf/scene/scene: move it to dnerf/scene"),
+        ("dnerf/scene", "dnerf", "found in {0}/dnerf/scene: check the folder above, {0}"),
+    ],
+)
+def test_what_lies_elsewhere_is_found(tmp_path, dnerf, place, root, says):
+    shutil.move(dnerf[0], tmp_path / "moved")
+    (tmp_path / place).parent.mkdir(parents=True, exist_ok=True)
+    shutil.move(tmp_path / "moved", tmp_path / place)
+    made = found(DNERF, tmp_path / root, dnerf[1])
+    assert (made.state, made.words) == (ABSENT, says.format(tmp_path))
+
+
+def test_a_scene_of_another_dataset_with_the_same_name_is_not_taken_for_it(tmp_path, dnerf):
+    shutil.move(dnerf[0], tmp_path / "blender" / "scene")
+    fewer(tmp_path / "blender" / "scene")
+    assert found(DNERF, tmp_path, dnerf[1]).words == ""
 
 
 def another_image(folder):

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import hashlib
+import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -16,6 +18,8 @@ _PNG, _JPEG = ".png", ".jpg"
 _FRAMES = 100  # of an NHR recording that the paper uses
 _SPLITS = ("train", "val", "test")
 _DIGITS = 32  # of a digest
+_MARKS = ("transforms_train.json", "scene.json", "CamPose.inf")  # files of which each scene has one
+_DEEP = 3  # levels of folders in which a scene is looked for that is not where it belongs
 
 
 @dataclass(frozen=True)
@@ -55,8 +59,20 @@ class Dataset:
 
     def found(self, root: Path) -> Iterator[Found]:
         """Look at each scene below ``root``, the folder of all datasets; see ``check``."""
+        places = [root, *_folders_in(root, _DEEP)]
         for scene, wanted in self.scenes.items():
             folder = root / self.folder / scene
+            if not _is_scene(folder):
+                others = (place / scene for place in places if place / scene != folder)
+                if (
+                    other := next((p for p in others if self._is_misplaced(p, root, wanted)), None)
+                ) is not None:
+                    target = folder.relative_to(root).as_posix()
+                    words = f"found in {other.relative_to(root).as_posix()}: move it to {target}"
+                    if other.parent == root and root.resolve().name == self.folder:
+                        words = f"found in {other}: check the folder above, {root.resolve().parent}"
+                    yield Found(scene, ABSENT, words)
+                    continue
             if not folder.is_dir():
                 yield Found(scene, ABSENT)
                 continue
@@ -64,6 +80,20 @@ class Dataset:
                 yield Found(scene, *self.check(folder, wanted))
             except SceneError as error:
                 yield Found(scene, INCOMPLETE, str(error))
+
+    def _is_misplaced(self, other: Path, root: Path, wanted: object) -> bool:
+        """Tell whether a folder of a scene's name holds it: in the dataset's own folder one of its kind
+        does, elsewhere one that is complete, as other datasets have scenes of these names, too.
+        """
+        if not _is_scene(other):
+            return False
+        if (root / self.folder) in other.parents:
+            return True
+        try:
+            self.check(other, wanted)
+        except SceneError:
+            return False
+        return True
 
 
 @dataclass(frozen=True)
@@ -80,6 +110,20 @@ class Blender:
     poses: str | None = None
     everything: str | None = None
     size: tuple[int, int] | None = None
+
+
+def _is_scene(folder: Path) -> bool:
+    return any((folder / name).is_file() for name in _MARKS)
+
+
+def _folders_in(folder: Path, deep: int) -> Iterator[Path]:
+    """Yield the folders in a folder, down to ``deep`` levels, without links, in the order of their names."""
+    with suppress(OSError), os.scandir(folder) as entries:
+        inner = sorted(entry.path for entry in entries if entry.is_dir(follow_symlinks=False))
+        for path in map(Path, inner):
+            yield path
+            if deep > 1:
+                yield from _folders_in(path, deep - 1)
 
 
 def digest_of(folder: Path, names: Iterable[str]) -> str:
