@@ -87,6 +87,11 @@ def test_a_checkpoint_of_earlier_names_loads_and_renders_the_same():
     view, black = View(DATA.scene.train[0].camera), torch.zeros(3)
     images = [made.method.at(Moment(0.3)).render(view, black).rgb for made in (module, fresh)]
     assert torch.equal(*images)
+    for was, now in (
+        ("nodes.bodies.of_node", "deformation.nodes.groups"),
+        ("nodes.bodies.lead", "hook.bodies.lead"),
+    ):
+        assert Particles.current_names(module.method, {was: None}).keys() == {now}
 
 
 def test_image_losses_are_weighted_with_the_photo_term():

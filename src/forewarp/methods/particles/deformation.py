@@ -68,7 +68,7 @@ class Deformation(nn.Module):
         motion_time = nodes.motion_time(time)
         nodes.extend(motion_time)
         basis = nodes.summed_basis((motion_time, 1.0))
-        return NodesNow(time, motion_time, basis, *nodes.carried(time, basis))
+        return NodesNow(time, motion_time, basis, *nodes.motion_and_maps(basis))
 
     def gradients(
         self,
@@ -77,6 +77,7 @@ class Deformation(nn.Module):
         factors: Mapping[str, float],
         extent: float,
         more_by_motion: Tensor | None = None,
+        learns: bool = True,
     ) -> tuple[dict[str, float], dict[str, Tensor]]:
         """Return the terms ``rigid`` and ``smooth``, and gradients by the nodes' parameters of both and of an
         image's loss, in one pass back from maps to curves.
@@ -87,6 +88,7 @@ class Deformation(nn.Module):
             factors: weights of the terms.
             extent: of the scene, world units.
             more_by_motion: gradients by ``now.motion`` of other terms; None: there are none.
+            learns: whether curves do; else their gradients are 0.
         """
         nodes, terms = self.nodes, {}
         edges, rigid = (nodes.edges, nodes.edge_weights), factors.get("rigid", 0.0)
@@ -94,10 +96,8 @@ class Deformation(nn.Module):
         by_motion = by_motion if more_by_motion is None else by_motion + more_by_motion
         smooth = factors.get("smooth", 0.0)
         terms["smooth"], gradients = nodes.backward(
-            now.time, now.motion_time, now.basis, by_motion, smooth, extent
+            now.time, now.motion_time, now.basis, by_motion, smooth, extent, learns
         )
-        if nodes.led:
-            gradients["bodies.twists"] = nodes.bodies.gradients(now.time, by_maps)
         return terms, {f"nodes.{name}": gradient for name, gradient in gradients.items()}
 
     def static_mask(self, fixed: Tensor | None) -> Tensor | None:

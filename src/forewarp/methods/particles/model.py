@@ -17,10 +17,10 @@ from forewarp.fields.moving import GaussiansSnapshot, MovingGaussians, NodeMotio
 from forewarp.losses import IMAGE_LOSSES, robust
 from forewarp.methods.method import Method, Snapshot, Start, Step, value_at
 from forewarp.methods.particles import exposure
-from forewarp.methods.particles.contact import known_depth, place_on_ground
 from forewarp.methods.particles.deformation import Deformation, standing
 from forewarp.methods.particles.density import DensityControl
-from forewarp.methods.particles.follow import follow, put_on_ground
+from forewarp.methods.particles.films.contact import known_depth, place_on_ground
+from forewarp.methods.particles.films.tracking import body_tracking
 from forewarp.methods.particles.gaussians import GaussianModel, coefficients
 from forewarp.methods.particles.nodes import Nodes, Skinning, TimeOffsets, are_rows
 from forewarp.methods.particles.options import EFFECTS, SMALLEST, Effects, Numbers, view_share
@@ -65,6 +65,7 @@ class Particles(Method):
         gaussians: what is learned of each (``GaussianModel``).
         deformation: how they move (``Deformation``); None: they do not.
         density: when and where they are split and removed (``DensityControl``).
+        hook: what moves nodes in place of their curves for a while (``TrainingHook``); None: nothing does.
 
     Args:
         start: what it is built from; for the stage's numbers see ``options.Numbers``.
@@ -85,6 +86,8 @@ class Particles(Method):
     earlier_names = (
         *((name, f"gaussians.{name}") for name in GaussianModel.ROWS),
         *((name, f"density.{name}") for name in (*DensityControl.ROWS, "round")),
+        ("nodes.bodies.of_node", "deformation.nodes.groups"),
+        ("nodes.bodies.", "hook.bodies."),
         *((name, f"deformation.{name}") for name in ("resting", "nodes.", "skinning.")),
     )
 
@@ -130,9 +133,10 @@ class Particles(Method):
         # Rows of the run that windows of a film begin from: particles that stay as they are; -1: of its own.
         self.register_buffer("shared", values.get("shared"))
         self.density = DensityControl(len(self.gaussians), self.stage)
-        self.least_motion, self.deformation = effects.background, None
+        self.least_motion, self.deformation, self.hook = effects.background, None, None
         if effects.motion is not None:
             self.deformation = self._deformation(start, effects, is_placed, body_of)
+            self.hook = body_tracking(self.deformation.nodes, times, self.stage.bodies)
         self.grows = tuple(f"gaussians.{name}" for name in self.gaussians.rows)
         self.grows += tuple(f"density.{name}" for name in self.density.ROWS)
         self.grows += () if self.shared is None else ("shared",)
@@ -170,7 +174,7 @@ class Particles(Method):
         else:
             body_of = (torch.full((len(means),), -1) if body_of is None else body_of)[free]
         points, edges = None if start.blank else means[free], stage.edges
-        more = {"rotates": rotates, "rests": rests, "edges": edges, "body_of": body_of, "times": times}
+        more = {"rotates": rotates, "rests": rests, "edges": edges, "group_of": body_of}
         return Deformation(Nodes(points, nodes, curve, offsets, **more), means, resting, fixed)
 
     def _first_values(self, start: Start, places: bool) -> dict[str, Tensor]:
@@ -292,7 +296,18 @@ class Particles(Method):
 
     def warp(self, time: float) -> Warp:
         """Return how all Gaussians move from the canonical state to a time."""
-        return standing(self.gaussians.means) if self.deformation is None else self.deformation.warp(time)
+        if self.deformation is None:
+            return standing(self.gaussians.means)
+        nodes = self.deformation.nodes
+        motion, maps = nodes.motion_and_maps(nodes.basis(time))
+        if self.is_led:
+            self.hook.move(time, motion, maps)
+        return self.deformation.warp_by(maps)
+
+    @property
+    def is_led(self) -> bool:
+        """Whether a hook moves nodes in place of their curves."""
+        return self.hook is not None and self.hook.leads
 
     @torch.no_grad()
     def look(self, batch: Batch, factors: Mapping[str, float], generator: torch.Generator) -> Step:
@@ -300,8 +315,8 @@ class Particles(Method):
         terms, gradients = dict.fromkeys(self.terms, 0.0), {}
         squared, numbers, views, has_depth = 0.0, 0, len(batch.observations), False
         for whole in batch.observations:
-            if self.deformation is not None and self.deformation.nodes.led:
-                follow(self, whole)
+            if self.is_led:
+                self.hook.before_image(self, whole)
             seen = self._smaller(whole)
             covered = float(self.covered_pixels) * len(seen.view) / len(whole.view)
             squared_error, of_image, found = self._compare(seen, factors, generator, views, covered)
@@ -347,11 +362,13 @@ class Particles(Method):
             parameter.
         """
         time, gaussians = self._jittered(seen.moment.time, generator), self.gaussians
-        deformation, now = self.deformation, None
+        deformation, now, is_led = self.deformation, None, self.is_led
         if deformation is None:
             warp = standing(gaussians.means)
         else:
             now = deformation.at(time)
+            if is_led:
+                self.hook.move(time, now.motion, now.maps)
             warp = deformation.warp_by(now.maps)
         light, terms = self.light(seen.moment), {}
         loss = self._image_loss(factors, terms)
@@ -387,10 +404,15 @@ class Particles(Method):
         else:
             rigid = factors.get("rigid", 0.0) * self.stage.rigid_final_factor**self.progress
             factors = dict(factors) | {"rigid": rigid}
-            of_motion, by_nodes = deformation.gradients(now, compared.maps, factors, extent, by_motion)
+            of_motion, by_nodes = deformation.gradients(
+                now, compared.maps, factors, extent, by_motion, learns=not is_led
+            )
             terms |= of_motion
             by_nodes["skinning.logits"] = compared.skin
             gradients |= {f"deformation.{name}": value for name, value in by_nodes.items()}
+        if is_led:
+            by_hook = self.hook.gradients(time, compared.maps)
+            gradients |= {f"hook.{name}": value for name, value in by_hook.items()}
         for name, gradient in by_name.items():
             gradients[name] = gradients[name] + gradient if name in gradients else gradient
         if fixed is not None:
@@ -429,7 +451,7 @@ class Particles(Method):
     def _jittered(self, time: float, generator: torch.Generator) -> float:
         """Shift an image's time at random, less and less, so that curves do not follow single images."""
         deviation = self.stage.jitter * max(0.0, 1 - self.progress / self.stage.jitter_until)
-        if self.deformation is None or self.deformation.nodes.led or deviation == 0:
+        if self.deformation is None or self.is_led or deviation == 0:
             return time
         return min(1.0, max(0.0, time + deviation * float(torch.randn((), generator=generator))))
 
@@ -440,9 +462,8 @@ class Particles(Method):
         decays of opacity the rate of opacity.
         """
         self.progress, stage, deformation = progress, self.stage, self.deformation
-        if deformation is not None and deformation.nodes.led and progress >= stage.bodies:
-            put_on_ground(self)
-            deformation.nodes.take_over()
+        if self.is_led:
+            self.hook.update(self, progress)
         self.gaussians.bound_opacity()
         for group in optimizer.param_groups:
             if group["name"] in ("means", "node_translations", "node_bodies"):
@@ -487,7 +508,7 @@ class Particles(Method):
         if deformation is None or int(self.density.round) % stage.relink:
             return
         deformation.reskin(self.gaussians.means.data, optimizer, self.fixed)
-        if self.least_motion is not None and progress >= stage.rest_from and not deformation.nodes.led:
+        if self.least_motion is not None and progress >= stage.rest_from and not self.is_led:
             least = max(self.least_motion, pixel_width(float(self.covered_pixels))) * float(self.extent)
             deformation.freeze_static_nodes(self.gaussians, self.ends, least, self.fixed)
 
@@ -501,6 +522,10 @@ class Particles(Method):
         groups = {name: [parameter] for name, parameter in named}
         if self.deformation is not None:
             groups |= {"skinning": [self.deformation.skinning.logits]} | self.deformation.nodes.param_groups()
+        if self.hook is not None:
+            groups |= self.hook.param_groups()
+        if "time_offsets" in groups:  # last, as checkpoints number parameters
+            groups["time_offsets"] = groups.pop("time_offsets")
         return groups
 
     def optimizer(self, groups: list[dict]) -> torch.optim.Optimizer:
@@ -509,8 +534,8 @@ class Particles(Method):
         optimizer.register_step_post_hook(
             lambda *_: self.density.decay_opacity(self.gaussians.opacity, self.fixed)
         )
-        if self.deformation is not None and self.deformation.nodes.bodies is not None:
-            optimizer.register_step_post_hook(lambda *_: self.deformation.nodes.bodies.settle())
+        if self.hook is not None:
+            optimizer.register_step_post_hook(lambda *_: self.hook.after_step())
         return optimizer
 
     def protocol(self) -> dict[str, str]:
@@ -529,9 +554,9 @@ class Particles(Method):
         motion, gaussians = None, self.gaussians
         if self.deformation is not None:
             nodes, skinning = self.deformation.nodes, self.deformation.skinning
-            if nodes.led:
+            if self.is_led:
                 nodes = copy.deepcopy(nodes)
-                nodes.take_over()
+                self.hook.fit_curves(nodes)
             offsets = nodes.time_offsets
             times = [] if offsets is None else offsets.times
             curves = nodes.translations.data, _data(nodes.rotations), nodes.curve

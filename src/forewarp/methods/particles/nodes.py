@@ -9,7 +9,6 @@ from torch import Tensor, nn
 
 from forewarp.fields.curves import Curve
 from forewarp.fields.moving import around
-from forewarp.methods.particles.bodies import Bodies
 from forewarp.ops.nodes import carry_nodes, skin_weights, spread_nodes
 from forewarp.scene.cloud import far_apart, nearest
 
@@ -21,8 +20,7 @@ _FULL = 0.05  # share of a spline's basis at a time, from which on its knot coun
 _FARTHEST = 0.2  # of all time: no image's time is off by more
 _BEYOND = _FARTHEST + 2 * _HALF_STEP  # of all time, by which a curve must reach beyond [0, 1]
 _REST_TIMES = 16  # over which a node's mean place is taken
-_FEWEST = 20  # nodes of a body
-_LOOSE = 1e-4  # how much curves are kept small where they take over from bodies
+_FEWEST = 20  # nodes of a group
 _PULL = 0.1  # of the learning rate: by how much a step draws an offset towards 0
 
 
@@ -73,7 +71,7 @@ class Nodes(nn.Module):
     """M nodes at rest ``positions`` (M, 3), each with a curve of translations and of rotations over time.
 
     Parameters are the curves' coefficients (M, K, 3): ``translations`` in world units, and ``rotations`` as
-    Gibbs vectors, None where nodes do not rotate; with ``bodies`` as quaternions (M, K, 4), see
+    Gibbs vectors, None where nodes do not rotate; with ``groups`` as quaternions (M, K, 4), see
     ``ops.nodes.node_maps``.
 
     Args:
@@ -84,9 +82,8 @@ class Nodes(nn.Module):
         rotates: whether nodes rotate.
         rests: whether nodes may ``stop``; ``stopped`` (M,) bool says which have.
         edges: neighbours that a node is kept rigid with.
-        body_of: (N,) int64, the body that each of ``points`` is of, -1: of none; None: there are no
-            ``bodies``. Nodes, links and edges are of one body each, or of none.
-        times: of training images, for poses of bodies.
+        group_of: (N,) int64, the group that each of ``points`` is of, as the body of it, -1: of none; None:
+            there are no ``groups`` (M,). Nodes, links and edges are of one group each, or of none.
     """
 
     loose = ("edges", "edge_weights")  # few nodes have few neighbours
@@ -101,68 +98,39 @@ class Nodes(nn.Module):
         rotates: bool = True,
         rests: bool = False,
         edges: int = 6,
-        body_of: Tensor | None = None,
-        times: Sequence[float] = (),
+        group_of: Tensor | None = None,
     ) -> None:
         super().__init__()
         self.curve, self.time_offsets = curve, time_offsets
         rows, positions = None, torch.zeros(1, 3)
         if points is not None:
-            rows = far_apart(points, count) if body_of is None else _of_each(body_of, points, count)
+            rows = far_apart(points, count) if group_of is None else _of_each(group_of, points, count)
             positions = points[rows].clone()
-            if body_of is not None:
-                body_of = _large(body_of, rows)
-        count, self.bodies = len(positions), None
-        if body_of is not None:
-            of_node = torch.full((1,), -1) if rows is None else body_of[rows]
-            self.bodies = Bodies(of_node, positions, times, curve.canonical_time)
+        count, groups = len(positions), None
+        if group_of is not None:
+            groups = torch.full((1,), -1) if rows is None else _large(group_of, rows)[rows]
         squared, neighbours = nearest(positions, positions, edges + 1)
         squared, neighbours = squared[:, 1:], neighbours[:, 1:]  # the nearest is the node itself
         unit = squared.mean() if squared.numel() else torch.tensor(1.0)
         padded = squared + 1e-3 * unit
         stiffness = (padded > _LEAST) / padded.clamp(min=_LEAST)
-        if self.bodies is not None:
-            stiffness = stiffness * (of_node[neighbours] == of_node[:, None])
+        if groups is not None:
+            stiffness = stiffness * (groups[neighbours] == groups[:, None])
         spacing = squared[:, :3].sqrt().mean(-1) if squared.shape[1] else torch.ones(count)
         self.translations = nn.Parameter(torch.zeros(count, curve.count, 3))
-        numbers = 3 if self.bodies is None else 4
+        numbers = 3 if groups is None else 4
         self.rotations = nn.Parameter(torch.zeros(count, curve.count, numbers)) if rotates else None
         self.register_buffer("positions", positions)
+        self.register_buffer("groups", groups)
         self.register_buffer("edges", neighbours.contiguous())
         self.register_buffer("edge_weights", stiffness / max(neighbours.numel(), 1))
         self.register_buffer("spacing", spacing.clamp(min=1e-6 * max(float(unit), _LEAST) ** 0.5))
         self._averaged: tuple[list[float], Tensor] | None = None  # see _mean_basis
         self.register_buffer("stopped", torch.zeros(count, dtype=torch.bool) if rests else None)
         self.register_buffer("seen_times", torch.tensor([curve.canonical_time] * 2))  # from, to
-        names = ("positions", "edges", "edge_weights", "spacing", "stopped", "translations", "rotations")
+        names = ("positions", "groups", "edges", "edge_weights", "spacing", "stopped")
+        names += ("translations", "rotations")
         self.grows = tuple(name for name in names if getattr(self, name) is not None)
-        self.grows += () if self.bodies is None else ("bodies.of_node",)
-
-    @property
-    def led(self) -> bool:
-        """Whether bodies lead their nodes, and nothing else moves."""
-        return self.bodies is not None and bool(self.bodies.lead)
-
-    @torch.no_grad()
-    def take_over(self) -> None:
-        """Fit the curves of nodes to the poses of bodies, by least squares; from then on they lead."""
-        bodies, own, motion = self.bodies, self.bodies.of_node >= 0, []
-        for time in bodies.times:
-            now = self.positions.new_zeros(len(own), 7)
-            bodies.carry(bodies.at(time), self.positions, now, self.positions.new_zeros(len(own), 12))
-            now[:, 6] += 1.0
-            if motion:  # q and -q turn alike; curves must not change sides
-                now[(now[:, 3:] * motion[-1][:, 3:]).sum(-1) < 0, 3:] *= -1
-            motion.append(now)
-        motion = torch.stack(motion, 1)[own].double()
-        motion[motion[:, bodies.row(self.curve.canonical_time), 6] < 0, :, 3:] *= -1  # at rest it is 1
-        motion[..., 6] -= 1.0
-        bases = torch.stack([self.basis(time) for time in bodies.times]).double()
-        normal = bases.T @ bases + _LOOSE * torch.eye(bases.shape[1]).to(bases)
-        curves = torch.linalg.solve(normal, bases.T @ motion).float()
-        self.translations.data[own], self.rotations.data[own] = curves[..., :3], curves[..., 3:]
-        self.seen_times.copy_(self.seen_times.new_tensor([0.0, 1.0]))
-        bodies.lead.fill_(False)
 
     def links(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """Return the nodes that points (N, 3) follow: rows (N, L) int32, and their shares (N, L).
@@ -171,8 +139,8 @@ class Nodes(nn.Module):
         """
         squared, rows = nearest(points, self.positions, LINKS)
         shares = torch.exp(-(squared - squared[:, :1]) / (2 * self.spacing[rows] ** 2))
-        if self.bodies is not None:
-            of = self.bodies.of_node[rows]
+        if self.groups is not None:
+            of = self.groups[rows]
             shares = shares * (of == of[:, :1])
         return rows.int(), (shares / shares.sum(-1, keepdim=True)).contiguous()
 
@@ -192,21 +160,13 @@ class Nodes(nn.Module):
         """Return the motion (M, 6 or 7) for a curve's basis (K,), and the nodes' maps (M, 12)."""
         return carry_nodes(self.translations, self.rotations, basis, self.positions)
 
-    def carried(self, time: float, basis: Tensor) -> tuple[Tensor, Tensor]:
-        """Return ``motion_and_maps`` at a given time with this basis; by bodies, while they lead."""
-        motion, maps = self.motion_and_maps(basis)
-        if self.led:
-            self.bodies.carry(self.bodies.at(time), self.positions, motion, maps)
-        return motion, maps
-
     def maps(self, time: float) -> Tensor:
         """Return the nodes' maps (M, 12) at a given time; see ``ops.nodes.node_maps``."""
-        return self.carried(time, self.basis(time))[1]
+        return self.motion_and_maps(self.basis(time))[1]
 
     def param_groups(self) -> dict[str, list[nn.Parameter]]:
         """Return what is learned, by the name of its learning rate."""
         groups = {"node_translations": [self.translations], "node_rotations": self._coefficients()[1:]}
-        groups["node_bodies"] = [] if self.bodies is None else [self.bodies.twists]
         groups["time_offsets"] = [] if self.time_offsets is None else [self.time_offsets.values]
         return {name: group for name, group in groups.items() if group}
 
@@ -276,8 +236,9 @@ class Nodes(nn.Module):
         return None if fits else f"{prefix}edges"
 
     def backward(
-        self, time: float, motion_time: float, basis: Tensor, by_motion: Tensor, factor: float, unit: float
-    ) -> tuple[float, dict[str, Tensor]]:
+        self, time: float, motion_time: float, basis: Tensor, by_motion: Tensor, factor: float, unit: float,
+        learns: bool = True,
+    ) -> tuple[float, dict[str, Tensor]]:  # fmt: skip
         """Carry gradients by the motion at a time to the coefficients and time offsets; keep curves smooth.
 
         Added to the loss is ``factor mean |x(t + h) - 2 x(t) + x(t - h)|^2 / unit^2``, h the distance of
@@ -289,6 +250,7 @@ class Nodes(nn.Module):
             by_motion: gradients (M, 6 or 7) by the motion of nodes.
             factor: weight of the second differences.
             unit: a length, world units.
+            learns: whether curves do; else their gradients are 0.
 
         Returns:
             the mean of the squared second differences, and gradients by the parameters' names.
@@ -296,9 +258,9 @@ class Nodes(nn.Module):
         bend = self._second_difference(motion_time) if factor else torch.zeros_like(basis)
         coefficients = self.translations, self.rotations
         *gradients, bent = spread_nodes(*coefficients, by_motion, basis, bend, factor, unit)
-        if self.led:
+        if not learns:
             for gradient in gradients:
-                gradient.zero_()  # nothing else moves
+                gradient.zero_()
         if self.stopped is not None and bool(self.stopped.any()):
             for gradient in gradients:
                 if gradient is not None:
@@ -335,20 +297,20 @@ class Nodes(nn.Module):
         return self.summed_basis((after, 1.0), (middle, -2.0), (before, 1.0))
 
 
-def _large(body_of: Tensor, rows: Tensor) -> Tensor:
-    """Let only those be bodies, numbered anew, that have as many nodes as say where they are."""
-    made, count = torch.full_like(body_of, -1), 0
-    for body in body_of.unique().tolist():
-        if body >= 0 and int((body_of[rows] == body).sum()) >= _FEWEST:
-            made[body_of == body], count = count, count + 1
+def _large(group_of: Tensor, rows: Tensor) -> Tensor:
+    """Let only those be groups, numbered anew, that have as many nodes as say where they are."""
+    made, count = torch.full_like(group_of, -1), 0
+    for group in group_of.unique().tolist():
+        if group >= 0 and int((group_of[rows] == group).sum()) >= _FEWEST:
+            made[group_of == group], count = count, count + 1
     return made
 
 
-def _of_each(body_of: Tensor, points: Tensor, count: int) -> Tensor:
-    """Choose about ``count`` rows of points (N, 3) that are far apart: of each body by its share of them."""
+def _of_each(group_of: Tensor, points: Tensor, count: int) -> Tensor:
+    """Choose about ``count`` rows of points (N, 3) that are far apart: of each group by its share of them."""
     rows = []
-    for body in body_of.unique().tolist():
-        own = (body_of == body).nonzero()[:, 0]
+    for group in group_of.unique().tolist():
+        own = (group_of == group).nonzero()[:, 0]
         rows.append(own[far_apart(points[own], max(4, round(count * len(own) / len(points))))])
     return torch.cat(rows)
 

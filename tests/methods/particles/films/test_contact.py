@@ -7,9 +7,9 @@ import pytest
 import torch
 
 from forewarp.methods.method import Start
-from forewarp.methods.particles.bodies import Poses
-from forewarp.methods.particles.contact import place_on_ground, things_on_the_ground
-from forewarp.methods.particles.follow import _again, _body_of, follow, put_on_ground
+from forewarp.methods.particles.films.bodies import Poses
+from forewarp.methods.particles.films.contact import place_on_ground, things_on_the_ground
+from forewarp.methods.particles.films.tracking import _again, body_of
 from forewarp.methods.particles.model import Particles
 from forewarp.ops.gaussians import FLAT, moved
 from forewarp.scene.frame import where_seen
@@ -65,11 +65,11 @@ def test_particles_of_what_moves_are_replaced_at_the_distance_of_the_ground(
 ):
     """It is a body only if all that moves, here 12 % of the image, is small."""
     method, away = before
-    monkeypatch.setattr("forewarp.methods.particles.contact.SMALL_MOVERS", small)
+    monkeypatch.setattr("forewarp.methods.particles.films.contact.SMALL_MOVERS", small)
     monkeypatch.setattr(method, "light", lambda moment: light)
     mask = masked((6, 12, 6, 14))
     monkeypatch.setattr(
-        "forewarp.methods.particles.contact.things_on_the_ground", lambda moving, depth: [(mask, away)]
+        "forewarp.methods.particles.films.contact.things_on_the_ground", lambda moving, depth: [(mask, away)]
     )
     old = {name: value.clone() for name, value in method.values().items()}
     new = place_on_ground(old, scene_with(mask), method.drawn, method.light_of)
@@ -119,7 +119,7 @@ def test_without_masks_or_known_ground_or_with_measured_depth_nothing_changes(be
 def test_what_was_set_down_follows_nodes(before, monkeypatch, trusts):
     """Masks count only where the stage trusts them; what they show to move never rests."""
     monkeypatch.setattr("forewarp.methods.particles.nodes._FEWEST", 1)  # a few particles are a body
-    monkeypatch.setattr("forewarp.methods.particles.contact.SMALL_MOVERS", 0.2)
+    monkeypatch.setattr("forewarp.methods.particles.films.contact.SMALL_MOVERS", 0.2)
     method, _ = before
     rests = torch.ones(SIZE, dtype=torch.bool)
     scene = scene_with(masked((6, 12, 6, 14)), load_resting=lambda: rests)
@@ -132,12 +132,12 @@ def test_what_was_set_down_follows_nodes(before, monkeypatch, trusts):
         assert len(fresh)
         assert not bool(fine.deformation.resting[fresh].any())
         assert bool((fine.deformation.skinning.shares[fresh].sum(-1) > 0.99).all())
-        assert len(fine.deformation.nodes.bodies) == 1
-        followed = fine.deformation.nodes.bodies.of_node[fine.deformation.skinning.links[fresh].long()]
+        assert len(fine.hook.bodies) == 1
+        followed = fine.deformation.nodes.groups[fine.deformation.skinning.links[fresh].long()]
         assert bool((followed[fine.deformation.skinning.shares[fresh] > 0] == 0).all())
         assert bool(fine.deformation.resting.any())
         # An export before the nodes take over has the motion of bodies too, and leaves them the lead.
-        bodies, slow = fine.deformation.nodes.bodies, torch.tensor([0.1, 0.0, 0.05])
+        bodies, slow = fine.hook.bodies, torch.tensor([0.1, 0.0, 0.05])
         for time in bodies.times:
             bodies.put(time, Poses(torch.eye(3)[None], bodies.rest + time * slow), torch.ones(3))
         for time in bodies.times:
@@ -146,10 +146,10 @@ def test_what_was_set_down_follows_nodes(before, monkeypatch, trusts):
             )
             torch.testing.assert_close(written, exact, atol=2e-3, rtol=0.0)
             torch.testing.assert_close(exact[fresh], fine.gaussians.means.data[fresh] + time * slow)
-        assert fine.deformation.nodes.led
+        assert fine.is_led
     else:
         assert count == 0
-        assert len(fine.deformation.nodes.bodies) == 0
+        assert len(fine.hook.bodies) == 0
 
 
 def test_a_checkpoint_is_loaded_without_a_look_at_masks(before):
@@ -166,7 +166,7 @@ def test_a_checkpoint_is_loaded_without_a_look_at_masks(before):
 def led(before, monkeypatch):
     """Particles of a fine stage with a body, and their scene."""
     monkeypatch.setattr("forewarp.methods.particles.nodes._FEWEST", 1)
-    monkeypatch.setattr("forewarp.methods.particles.contact.SMALL_MOVERS", 0.2)
+    monkeypatch.setattr("forewarp.methods.particles.films.contact.SMALL_MOVERS", 0.2)
     rests = torch.ones(SIZE, dtype=torch.bool)
     scene = scene_with(masked((6, 12, 6, 14)), load_resting=lambda: rests)
     numbers = {"rest_by_masks": True, "bodies": 0.5}
@@ -177,7 +177,7 @@ def led(before, monkeypatch):
 def test_a_body_is_moved_to_where_it_is_as_large_as_shown(led):
     """In the second of four rounds and the others, once each; in the first its shape is not known yet."""
     fine, scene = led
-    bodies, view = fine.deformation.nodes.bodies, View(FRAME.camera)
+    bodies, view = fine.hook.bodies, View(FRAME.camera)
     moment = Moment(next(time for time in sorted(fine.frames) if not bodies.seen[bodies.row(time)]))
     row = bodies.row(moment.time)
     bodies.seen[row] = True
@@ -190,7 +190,7 @@ def test_a_body_is_moved_to_where_it_is_as_large_as_shown(led):
         fine.progress = progress
         if share is not None:
             bodies.middles[0, row] = eye + share * (there - eye)
-        follow(fine, seen)
+        fine.hook.before_image(fine, seen)
         return float((bodies.middles[0, row] - eye).norm() / (there - eye).norm()) - 1
 
     assert abs(off(0.12, 1.05) - 0.05) < 1e-5
@@ -207,7 +207,7 @@ def test_a_body_is_seen_again_beside_where_it_was(led):
     the camera pans.
     """
     fine, scene = led
-    bodies = fine.deformation.nodes.bodies
+    bodies = fine.hook.bodies
     row = bodies.row(scene.canonical_time)
     held = bodies.middles[:, row]
     before = fine.frames[bodies.times[row]]
@@ -225,29 +225,29 @@ def test_a_body_is_seen_again_beside_where_it_was(led):
     frames = {bodies.times[row]: replace(before, load=lambda: image)}
     frames[0.9] = replace(before, camera=panned, load=lambda: other)
     turns = torch.tensor([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])[None]
-    found = _again(fine, frames, 0.9, row, Poses(turns, held))
+    found = _again(bodies, fine, frames, 0.9, row, Poses(turns, held))
     assert torch.equal(found.turns, turns)
     was, now, eye = camera.project(held)[0], panned.project(found.middles)[0], camera.center.float()
     torch.testing.assert_close(now - was, torch.tensor([[3.0, 1.0]]).to(was), atol=1e-3, rtol=0)
     torch.testing.assert_close((found.middles - eye).norm(), (held - eye).norm())
     frames[0.9] = replace(before, load=lambda: torch.full_like(image, 90))
-    assert torch.equal(_again(fine, frames, 0.9, row, Poses(turns, held)).middles, held)
+    assert torch.equal(_again(bodies, fine, frames, 0.9, row, Poses(turns, held)).middles, held)
 
 
 def test_what_rests_beside_a_body_is_not_of_it(led):
     fine, _ = led
     rests = fine.deformation.skinning.shares.sum(-1) == 0
-    fine.deformation.skinning.links[rests] = fine.deformation.skinning.links[_body_of(fine) == 0][:1]
+    fine.deformation.skinning.links[rests] = fine.deformation.skinning.links[body_of(fine) == 0][:1]
     assert bool(rests.any())
-    assert bool((_body_of(fine)[rests] == -1).all())
+    assert bool((body_of(fine)[rests] == -1).all())
 
 
 def test_bodies_grow_until_they_touch_the_ground_and_images_stay_alike(led):
     fine, scene = led
-    bodies, view, eye = fine.deformation.nodes.bodies, View(FRAME.camera), FRAME.camera.center.float()
+    bodies, view, eye = fine.hook.bodies, View(FRAME.camera), FRAME.camera.center.float()
     canonical, time = scene.canonical_time, next(t for t in sorted(fine.frames) if t != scene.canonical_time)
     row, far = bodies.row(time), (bodies.rest - eye).norm(dim=-1)
-    fine.gaussians.opacity.data[_body_of(fine) < 0] = -20.0  # these would hide them
+    fine.gaussians.opacity.data[body_of(fine) < 0] = -20.0  # these would hide them
 
     def images():
         canon, turned = (fine.at(Moment(t)).render(view, torch.zeros(3)) for t in (canonical, time))
@@ -260,10 +260,10 @@ def test_bodies_grow_until_they_touch_the_ground_and_images_stay_alike(led):
         fine.gaussians.means.data.clone(),
         fine.deformation.nodes.positions.clone(),
     )
-    put_on_ground(fine)  # no ground is known
+    fine.hook.put_on_ground(fine)  # no ground is known
     assert torch.equal(fine.gaussians.means.data, means)
     bodies.farthest[:, row] = 1.2 * 0.5 * far
-    put_on_ground(fine)
+    fine.hook.put_on_ground(fine)
     for image, other in zip(images(), before, strict=True):
         torch.testing.assert_close(image, other, atol=1e-5, rtol=0)
     torch.testing.assert_close((bodies.middles[:, row] - eye).norm(dim=-1), 1.2 * 0.5 * far)
@@ -271,7 +271,7 @@ def test_bodies_grow_until_they_touch_the_ground_and_images_stay_alike(led):
     grown = torch.where(bodies.of_node >= 0, 1.2, 1.0)[:, None]
     torch.testing.assert_close(fine.deformation.nodes.positions - eye, grown * (nodes - eye))
     bodies.farthest[:, row] = 0.1 * far  # too far already
-    put_on_ground(fine)
+    fine.hook.put_on_ground(fine)
     torch.testing.assert_close((bodies.rest - eye).norm(dim=-1), 1.2 * far)
 
 
@@ -280,7 +280,7 @@ def test_bodies_lead_until_their_share_of_the_stage_is_over(led):
     """A step at an image follows them there, and is of their poses alone; nothing rests before it is over."""
     fine, scene = led
     groups = [{"name": n, "params": p, "lr": 1e-3, "base_lr": 1e-3} for n, p in fine.param_groups().items()]
-    optimizer, bodies = fine.optimizer(groups), fine.deformation.nodes.bodies
+    optimizer, bodies = fine.optimizer(groups), fine.hook.bodies
     index = max(range(len(scene.train)), key=lambda i: abs(scene.train[i].time - scene.canonical_time))
     time = scene.train[index].time
     assert not bool(bodies.seen[bodies.row(time)])
@@ -288,13 +288,13 @@ def test_bodies_lead_until_their_share_of_the_stage_is_over(led):
         SimpleNamespace(method=fine, generator=torch.Generator()), DATA, index, {"photo": 1.0}
     ).gradients
     assert bool(bodies.seen[bodies.row(time)])
-    assert bool(found["deformation.nodes.bodies.twists"][:, bodies.row(time)].any())
+    assert bool(found["hook.bodies.twists"][:, bodies.row(time)].any())
     assert not bool(
         found["deformation.nodes.translations"].any() | found["deformation.nodes.rotations"].any()
     )
     fine.density.round.fill_(44)
     fine.advance(0.4501, 0, optimizer)
-    assert fine.deformation.nodes.led
+    assert fine.is_led
     assert not bool(fine.deformation.nodes.stopped.any())
     assert not bool(fine.deformation.nodes.translations.any())
     row = bodies.row(time)
@@ -302,5 +302,5 @@ def test_bodies_lead_until_their_share_of_the_stage_is_over(led):
     fine.advance(0.5, 0, optimizer)
     away = (bodies.middles[:, row] - bodies.eyes[row]).norm(dim=-1)
     torch.testing.assert_close(away, bodies.farthest[:, row])  # put on the ground
-    assert not fine.deformation.nodes.led
+    assert not fine.is_led
     assert bool(fine.deformation.nodes.translations.any())

@@ -15,6 +15,10 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor, nn
 
+from forewarp.methods.particles.nodes import Nodes
+
+GROUPS = "deformation.nodes.groups"  # of nodes, in a stored state
+_LOOSE = 1e-4  # how much curves are kept small where they take over
 _LEAST = 1e-15
 _TOUCHES = 0.05  # share of images in which a body touches the ground
 _STEADY = 0.97  # of its distance that a body keeps, whatever is seen below it: masks are not exact
@@ -46,20 +50,17 @@ class Bodies(nn.Module):
     take them over at once (``settle``), so that they are 0 before each step.
 
     Args:
-        of_node: (M,) int64, the body that a node is of; -1: of none.
-        positions: (M, 3) of nodes at rest.
-        times: of training images, distinct.
-        canonical_time: near which bodies are at first as they rest.
+        nodes: M of them, each of a body, or of none: their ``groups``.
+        times: of training images, distinct; near the canonical one bodies are at first as they rest.
     """
 
     grows, loose = ("twists", "sizes", "rest", "turns", "middles", "farthest"), ()
 
-    def __init__(
-        self, of_node: Tensor, positions: Tensor, times: Sequence[float], canonical_time: float
-    ) -> None:
+    def __init__(self, nodes: Nodes, times: Sequence[float]) -> None:
         super().__init__()
+        self._nodes = (nodes,)  # in a tuple, as they are a part of the deformation
+        of_node, positions = nodes.groups, nodes.positions
         count, self.times = int(of_node.max()) + 1, sorted(times)
-        self.register_buffer("of_node", of_node)
         self.twists = nn.Parameter(torch.zeros(count, len(times), 6))
         own = [positions[of_node == body] for body in range(count)]
         sizes = torch.tensor([float((p - p.mean(0)).square().sum(-1).mean().sqrt()) for p in own])
@@ -74,16 +75,26 @@ class Bodies(nn.Module):
             "rounds", torch.zeros(len(times), dtype=torch.int64)
         )  # of fits that images were in
         self.register_buffer("lead", torch.tensor(count > 0))
-        self.seen[self.row(canonical_time)] = True
+        self.seen[self.row(nodes.curve.canonical_time)] = True
 
     def __len__(self) -> int:
         return len(self.sizes)
 
+    @property
+    def of_node(self) -> Tensor:
+        """The body (M,) int64 that a node is of; -1: of none."""
+        return self.nodes.groups
+
+    @property
+    def nodes(self) -> Nodes:
+        """What they move."""
+        return self._nodes[0]
+
     def misfit(self, state: dict[str, Tensor], prefix: str) -> str | None:
-        """Name the bodies of a stored state's nodes if there is one that there is not; None: all is well."""
-        of_node, count = state[prefix + "of_node"], len(state[prefix + "sizes"])
+        """Name the stored groups of nodes if one is of a body that there is not; None: all is well."""
+        of_node, count = state[GROUPS], len(state[prefix + "sizes"])
         fits = not len(of_node) or -1 <= int(of_node.min()) <= int(of_node.max()) < count
-        return None if fits else f"{prefix}of_node"
+        return None if fits else GROUPS
 
     def row(self, time: float) -> int:
         """Return the row of the training time nearest to a time."""
@@ -167,6 +178,26 @@ class Bodies(nn.Module):
         least = _STEADY * (now.middles - self.eyes[row]).norm(dim=-1)
         self.farthest[:, row] = farthest.maximum(least)
         self._put(row, now)
+
+    @torch.no_grad()
+    def fit_curves(self, nodes: Nodes) -> None:
+        """Fit the curves of nodes to the poses, by least squares."""
+        own, motion = self.of_node >= 0, []
+        for time in self.times:
+            now = nodes.positions.new_zeros(len(own), 7)
+            self.carry(self.at(time), nodes.positions, now, nodes.positions.new_zeros(len(own), 12))
+            now[:, 6] += 1.0
+            if motion:  # q and -q turn alike; curves must not change sides
+                now[(now[:, 3:] * motion[-1][:, 3:]).sum(-1) < 0, 3:] *= -1
+            motion.append(now)
+        motion = torch.stack(motion, 1)[own].double()
+        motion[motion[:, self.row(nodes.curve.canonical_time), 6] < 0, :, 3:] *= -1  # at rest it is 1
+        motion[..., 6] -= 1.0
+        bases = torch.stack([nodes.basis(time) for time in self.times]).double()
+        normal = bases.T @ bases + _LOOSE * torch.eye(bases.shape[1]).to(bases)
+        curves = torch.linalg.solve(normal, bases.T @ motion).float()
+        nodes.translations.data[own], nodes.rotations.data[own] = curves[..., :3], curves[..., 3:]
+        nodes.seen_times.copy_(nodes.seen_times.new_tensor([0.0, 1.0]))
 
     def _put(self, row: int, poses: Poses) -> None:
         away = poses.middles - self.eyes[row]

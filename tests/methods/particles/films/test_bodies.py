@@ -6,8 +6,15 @@ import pytest
 import torch
 
 from forewarp.fields.curves import Curve
-from forewarp.methods.particles.bodies import Poses
-from forewarp.methods.particles.follow import Look, Sight, find, find_shift, fit_distances, near_places
+from forewarp.methods.particles.films.bodies import GROUPS, Bodies, Poses
+from forewarp.methods.particles.films.tracking import (
+    PyramidLevel,
+    TrackingView,
+    find,
+    find_shift,
+    fit_distances,
+    near_places,
+)
 from forewarp.methods.particles.nodes import Nodes
 from forewarp.ops.nodes import carry_nodes, node_maps
 from forewarp.scene.camera import Camera
@@ -25,53 +32,59 @@ def rotation(*vector):
 
 
 @pytest.fixture
-def nodes():
+def bodies():
     """Two cubes, two apart, and between them points of no body."""
     points = torch.cat([CUBE - torch.tensor([1.0, 0.0, 0.0]), CUBE + torch.tensor([1.0, 0.0, 0.0]), CUBE[:8]])
     body_of = torch.tensor([0] * 64 + [1] * 64 + [-1] * 8)
-    return Nodes(points, 60, Curve("spline", 9, 21, 0.5), body_of=body_of, times=TIMES)
+    return Bodies(Nodes(points, 60, Curve("spline", 9, 21, 0.5), group_of=body_of), TIMES)
 
 
-def rolled(nodes, time, slow=1.0):
+def rolled(bodies, time, slow=1.0):
     """Poses of bodies that roll evenly, the first by more than half a turn in all."""
     far = slow * (time - 0.5)
     turns = torch.stack([rotation(0.0, 0.0, 7.0 * far), rotation(far, 0.0, 0.0)])
-    return Poses(turns, nodes.bodies.rest + far * torch.tensor([[0.5, 1.0, 0.0], [0.0, 0.0, 2.0]]))
+    return Poses(turns, bodies.rest + far * torch.tensor([[0.5, 1.0, 0.0], [0.0, 0.0, 2.0]]))
 
 
-def seen(nodes, *times, slow=1.0):
+def seen(bodies, *times, slow=1.0):
     for time in times:
-        nodes.bodies.put(time, rolled(nodes, time, slow), EYE)
+        bodies.put(time, rolled(bodies, time, slow), EYE)
 
 
 @torch.no_grad()
-def places(nodes, time):
-    motion = nodes.carried(time, nodes.basis(time))[0]
-    return nodes.positions + motion[:, :3]
+def motion_and_maps(bodies, time):
+    motion, maps = bodies.nodes.motion_and_maps(bodies.nodes.basis(time))
+    if bool(bodies.lead):
+        bodies.carry(bodies.at(time), bodies.nodes.positions, motion, maps)
+    return motion, maps
 
 
-def apart(nodes, poses, others):
-    return nodes.bodies.apart(poses, others).abs().amax()
+def places(bodies, time):
+    return bodies.nodes.positions + motion_and_maps(bodies, time)[0][:, :3]
 
 
-def shown(nodes, truth, time):
+def apart(bodies, poses, others):
+    return bodies.apart(poses, others).abs().amax()
+
+
+def shown(bodies, truth, time):
     """An image whose loss is how far nodes are from those of the truth, as a camera at ``EYE`` sees them."""
-    truth_maps = node_maps_of(nodes, truth)
+    truth_maps = node_maps_of(bodies, truth)
 
     def compare(maps):
         maps = maps.clone().requires_grad_()
         with torch.enable_grad():
             linear = (maps - truth_maps)[:, :9].reshape(-1, 3, 3)
-            off = (linear @ nodes.positions[..., None])[..., 0] + (maps - truth_maps)[:, 9:]
+            off = (linear @ bodies.nodes.positions[..., None])[..., 0] + (maps - truth_maps)[:, 9:]
             loss = off.square().sum()
             return torch.autograd.grad(loss, maps)[0], float(loss.detach())
 
-    return Sight(EYE, lambda places: [Look(compare, 200.0)] * 3, lambda row, going: going)
+    return TrackingView(EYE, lambda places: [PyramidLevel(compare, 200.0)] * 3, lambda row, going: going)
 
 
-def node_maps_of(nodes, poses):
-    maps = torch.zeros(len(nodes.positions), 12)
-    nodes.bodies.carry(poses, nodes.positions, torch.zeros(len(maps), 7), maps)
+def node_maps_of(bodies, poses):
+    maps = torch.zeros(len(bodies.nodes.positions), 12)
+    bodies.carry(poses, bodies.nodes.positions, torch.zeros(len(maps), 7), maps)
     return maps
 
 
@@ -79,44 +92,43 @@ def camera_at(width, height):
     return Camera(width, height, 50.0, 50.0, width / 2, height / 2, torch.eye(4), 0.1, 10.0)
 
 
-def test_nodes_links_and_edges_are_of_one_body_each(nodes):
-    of_node = nodes.bodies.of_node
+def test_nodes_links_and_edges_are_of_one_body_each(bodies):
+    of_node = bodies.of_node
     assert [int((of_node == body).sum()) for body in (0, 1, -1)] == [28, 28, 4]
-    ends = nodes.edges[nodes.edge_weights > 0]
-    starts = torch.arange(len(of_node))[:, None].expand_as(nodes.edges)[nodes.edge_weights > 0]
+    ends = bodies.nodes.edges[bodies.nodes.edge_weights > 0]
+    starts = torch.arange(len(of_node))[:, None].expand_as(bodies.nodes.edges)[bodies.nodes.edge_weights > 0]
     assert torch.equal(of_node[ends], of_node[starts])
-    rows, shares = nodes.links(torch.tensor([[0.52, 0.0, 0.0], [-0.75, 0.0, 0.0]]))
+    rows, shares = bodies.nodes.links(torch.tensor([[0.52, 0.0, 0.0], [-0.75, 0.0, 0.0]]))
     for row, share, body in zip(rows.long(), shares, (1, 0)):
         assert {*of_node[row[share > 0]].tolist()} == {body}
     torch.testing.assert_close(shares.sum(-1), torch.ones(2))
 
 
-def test_nodes_go_with_their_bodies_and_others_rest(nodes):
-    seen(nodes, 0.75)
-    poses, of_node = rolled(nodes, 0.75), nodes.bodies.of_node
-    now = places(nodes, 0.75)
+def test_nodes_go_with_their_bodies_and_others_rest(bodies):
+    seen(bodies, 0.75)
+    poses, of_node = rolled(bodies, 0.75), bodies.of_node
+    now = places(bodies, 0.75)
     for body in (0, 1):
-        own = nodes.positions[of_node == body] - nodes.bodies.rest[body]
+        own = bodies.nodes.positions[of_node == body] - bodies.rest[body]
         torch.testing.assert_close(
             now[of_node == body], own @ poses.turns[body].T + poses.middles[body], atol=1e-5, rtol=0.0
         )
-    assert torch.equal(now[of_node < 0], nodes.positions[of_node < 0])
-    with torch.no_grad():
-        motion, maps = nodes.carried(0.75, nodes.basis(0.75))
-    torch.testing.assert_close(node_maps(motion, nodes.positions), maps, atol=1e-5, rtol=1e-5)
+    assert torch.equal(now[of_node < 0], bodies.nodes.positions[of_node < 0])
+    motion, maps = motion_and_maps(bodies, 0.75)
+    torch.testing.assert_close(node_maps(motion, bodies.nodes.positions), maps, atol=1e-5, rtol=1e-5)
 
 
-def test_poses_lie_between_those_seen_and_stay_beyond_them(nodes):
-    seen(nodes, 0.75)
-    assert apart(nodes, nodes.bodies.at(0.6), rolled(nodes, 0.6)) < 1e-5
+def test_poses_lie_between_those_seen_and_stay_beyond_them(bodies):
+    seen(bodies, 0.75)
+    assert apart(bodies, bodies.at(0.6), rolled(bodies, 0.6)) < 1e-5
     for time, end in ((0.9, 0.75), (0.1, 0.5)):
-        assert apart(nodes, nodes.bodies.at(time), rolled(nodes, end)) < 1e-5
+        assert apart(bodies, bodies.at(time), rolled(bodies, end)) < 1e-5
 
 
-def test_gradients_are_those_of_poses_that_take_a_small_twist_over(nodes):
-    seen(nodes, 0.8)
-    factors = torch.randn(len(nodes.positions), 12, generator=torch.Generator().manual_seed(1))
-    bodies, row = nodes.bodies, nodes.bodies.row(0.8)
+def test_gradients_are_those_of_poses_that_take_a_small_twist_over(bodies):
+    seen(bodies, 0.8)
+    factors = torch.randn(len(bodies.nodes.positions), 12, generator=torch.Generator().manual_seed(1))
+    row = bodies.row(0.8)
     found = bodies.gradients(0.8, factors)
     others = torch.arange(len(TIMES)) != row
     assert not bool(found[:, others].any())
@@ -129,13 +141,13 @@ def test_gradients_are_those_of_poses_that_take_a_small_twist_over(nodes):
                 bodies.twists.data[body, row, number] = sign * small
                 bodies.settle()
                 assert not bool(bodies.twists.any())
-                sides.append(float((node_maps_of(nodes, bodies.at(0.8)).double() * factors).sum()))
+                sides.append(float((node_maps_of(bodies, bodies.at(0.8)).double() * factors).sum()))
             exact = (sides[0] - sides[1]) / (2 * small)
             assert float(found[body, row, number]) == pytest.approx(exact, rel=0.01, abs=0.05)
 
 
-def test_bodies_stay_before_what_is_behind_them(nodes):
-    bodies, poses = nodes.bodies, rolled(nodes, 0.6)
+def test_bodies_stay_before_what_is_behind_them(bodies):
+    poses = rolled(bodies, 0.6)
     away = (poses.middles - EYE).norm(dim=-1)
     bodies.put(0.6, poses, EYE)
     bodies.bring_before(0.6, torch.stack([0.99 * away[0], 0.5 * away[1]]))
@@ -147,36 +159,38 @@ def test_bodies_stay_before_what_is_behind_them(nodes):
 
 
 @pytest.mark.parametrize("kind", ["spline", "cosines"])
-def test_curves_take_over_where_bodies_are(nodes, kind):
+def test_curves_take_over_where_bodies_are(bodies, kind):
     """Cosines are exactly 0 at the canonical time, before which the first turns by more than half a turn."""
-    nodes.curve = Curve(kind, 18, 21, 0.5)
-    nodes.translations.data, nodes.rotations.data = torch.zeros(60, 18, 3), torch.zeros(60, 18, 4)
-    seen(nodes, *TIMES)
+    bodies.nodes.curve = Curve(kind, 18, 21, 0.5)
+    bodies.nodes.translations.data, bodies.nodes.rotations.data = (
+        torch.zeros(60, 18, 3),
+        torch.zeros(60, 18, 4),
+    )
+    seen(bodies, *TIMES)
     times = [0.1, 0.48, 0.77]
-    before = [places(nodes, time) for time in times]
-    assert nodes.led
-    nodes.take_over()
-    assert not nodes.led
+    before = [places(bodies, time) for time in times]
+    bodies.fit_curves(bodies.nodes)
+    bodies.lead.fill_(False)
     for time, place in zip(times, before):
-        assert (places(nodes, time) - place).norm(dim=-1).amax() < 0.02
-        linear = nodes.maps(time)[:, :9].reshape(-1, 3, 3) + torch.eye(3)
-        turns = rolled(nodes, time).turns[nodes.bodies.of_node]
-        assert (linear - turns)[nodes.bodies.of_node >= 0].abs().amax() < 0.05
+        assert (places(bodies, time) - place).norm(dim=-1).amax() < 0.02
+        linear = bodies.nodes.maps(time)[:, :9].reshape(-1, 3, 3) + torch.eye(3)
+        turns = rolled(bodies, time).turns[bodies.of_node]
+        assert (linear - turns)[bodies.of_node >= 0].abs().amax() < 0.05
 
 
 @pytest.mark.parametrize("slow", [1.0, 0.0], ids=["as before", "from rest"])
-def test_bodies_are_found_in_a_new_image(nodes, slow):
+def test_bodies_are_found_in_a_new_image(bodies, slow):
     """Even turns are foreseen; from rest, turns are held back by less than what the image says of them."""
-    seen(nodes, 0.5, 0.55, slow=slow)
-    truth = rolled(nodes, 0.6)
-    start = apart(nodes, nodes.bodies.at(0.6), truth)
-    found = find(nodes.bodies, 0.6, nodes.positions, shown(nodes, truth, 0.6))
-    assert apart(nodes, found, truth) < (0.05 if slow else 0.6) * start
+    seen(bodies, 0.5, 0.55, slow=slow)
+    truth = rolled(bodies, 0.6)
+    start = apart(bodies, bodies.at(0.6), truth)
+    found = find(bodies, 0.6, bodies.nodes.positions, shown(bodies, truth, 0.6))
+    assert apart(bodies, found, truth) < (0.05 if slow else 0.6) * start
 
 
-def test_distances_are_where_images_are_alike_or_go_there(nodes):
+def test_distances_are_where_images_are_alike_or_go_there(bodies):
     """At the lowest point of a parabola; if losses bend down, the way they fall; by broken ones, nowhere."""
-    poses = rolled(nodes, 0.5)
+    poses = rolled(bodies, 0.5)
     far = (poses.middles - EYE).norm(dim=-1)
 
     def reached(loss):
@@ -193,17 +207,17 @@ def test_distances_are_where_images_are_alike_or_go_there(nodes):
 
 
 @pytest.mark.slow
-def test_a_body_is_looked_for_where_it_is_seen_again(nodes):
+def test_a_body_is_looked_for_where_it_is_seen_again(bodies):
     """Where it would go on is too far away for steps; where it is seen again counts if that is better."""
-    truth = rolled(nodes, 0.5)
+    truth = rolled(bodies, 0.5)
     truth = truth.but(1, Poses(truth.turns, truth.middles + torch.tensor([0.0, 8.0, 0.0])))
-    image = shown(nodes, truth, 0.55)
-    reached = find(nodes.bodies, 0.55, nodes.positions, image)
+    image = shown(bodies, truth, 0.55)
+    reached = find(bodies, 0.55, bodies.nodes.positions, image)
     assert (reached.middles - truth.middles)[1].norm() > 4.0
-    found = find(nodes.bodies, 0.55, nodes.positions, image._replace(again=lambda row, going: truth))
+    found = find(bodies, 0.55, bodies.nodes.positions, image._replace(again=lambda row, going: truth))
     assert (found.middles - truth.middles).norm(dim=-1).amax() < 0.3
     wrong = Poses(truth.turns, truth.middles + 50.0)
-    found = find(nodes.bodies, 0.55, nodes.positions, image._replace(again=lambda row, going: wrong))
+    found = find(bodies, 0.55, bodies.nodes.positions, image._replace(again=lambda row, going: wrong))
     torch.testing.assert_close(found.middles, reached.middles)
 
 
@@ -251,17 +265,17 @@ def test_a_quaternion_of_length_0_turns_nothing():
         torch.testing.assert_close(found, torch.tensor([0.0] * 9 + [1.0] * 3).repeat(3, 1))
 
 
-def test_a_twist_that_is_no_number_leaves_the_pose(nodes):
-    nodes.bodies.twists.data[0, 3] = torch.nan
-    before = nodes.bodies.middles.clone()
-    nodes.bodies.settle()
-    assert torch.equal(nodes.bodies.middles, before)
-    assert not bool(nodes.bodies.twists.any())
+def test_a_twist_that_is_no_number_leaves_the_pose(bodies):
+    bodies.twists.data[0, 3] = torch.nan
+    before = bodies.middles.clone()
+    bodies.settle()
+    assert torch.equal(bodies.middles, before)
+    assert not bool(bodies.twists.any())
 
 
 @pytest.mark.parametrize("bad", [2, -2])
-def test_a_node_of_a_body_that_there_is_not_is_named(nodes, bad):
-    state = nodes.state_dict()
-    assert nodes.bodies.misfit(state, "bodies.") is None
-    state["bodies.of_node"] = torch.where(torch.arange(60) == 3, bad, state["bodies.of_node"])
-    assert nodes.bodies.misfit(state, "bodies.") == "bodies.of_node"
+def test_a_node_of_a_body_that_there_is_not_is_named(bodies, bad):
+    state = {"sizes": bodies.sizes, GROUPS: bodies.of_node}
+    assert bodies.misfit(state, "") is None
+    state[GROUPS] = torch.where(torch.arange(60) == 3, bad, bodies.of_node)
+    assert bodies.misfit(state, "") == GROUPS

@@ -53,7 +53,7 @@ def errors_of_turns(folder, seed):
     method, world = module.method.eval(), Filming(FORM).world
     frames = sorted(made.datamodule.scene.train, key=lambda frame: frame.time)
     turn = fitted([f.camera for f in frames], Filming(FORM).cameras([f.time for f in frames])).turn
-    of = method.deformation.nodes.bodies.of_node[method.deformation.skinning.links[:, 0].long()]
+    of = method.deformation.nodes.groups[method.deformation.skinning.links[:, 0].long()]
     assert int(of.max()) == 1  # two bodies
 
     def places(time):

@@ -12,22 +12,20 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from forewarp.fields.moving import GaussiansSnapshot
-from forewarp.methods.particles.bodies import Bodies, Poses
-from forewarp.methods.particles.contact import known_depth, things_on_the_ground
-from forewarp.methods.particles.deformation import Deformation
-from forewarp.methods.particles.gaussians import GaussianModel
-from forewarp.methods.particles.options import Numbers
-from forewarp.ops.gaussians import Gaussians, ImageLoss, Warp, moved
+from forewarp.methods.particles.films.bodies import Bodies, Poses
+from forewarp.methods.particles.films.contact import known_depth, things_on_the_ground
+from forewarp.methods.particles.hooks import Trained, TrainingHook
+from forewarp.methods.particles.nodes import Nodes
+from forewarp.ops.gaussians import Gaussians, Warp, moved
 from forewarp.ops.grid import dilate
 from forewarp.scene.camera import Camera
 from forewarp.scene.frame import Frame, where_seen
-from forewarp.scene.view import Moment, Observation, View
+from forewarp.scene.view import Observation, View
 
 _SIDES = 100, 200, 400  # pixels of the longer side of an image as it is looked at
 _SLIDES, _FALL = 10, 0.1  # steps in the first: of a pixel, that fall to this share of it
@@ -48,31 +46,7 @@ _FARTHEST = 3.0  # times the way between the two nearest images that a body may 
 _CELL = 0.05  # of an image's longer side: what lies within about one of a body is looked at with it
 
 
-class _Particles(Protocol):
-    """What is asked of the particles whose bodies are followed; see ``model.Particles``."""
-
-    gaussians: GaussianModel
-    deformation: Deformation
-    frames: Mapping[float, Frame]
-    progress: float
-    stage: Numbers
-
-    def at(self, moment: Moment) -> GaussiansSnapshot:
-        """Freeze them at a moment."""
-
-    def light(self, moment: Moment) -> Tensor | None:
-        """Return the gain and the bias of the colours of an image."""
-
-    def warp(self, time: float) -> Warp:
-        """Return how they move from the canonical state to a time."""
-
-    def compared(
-        self, seen: Observation, particles: Gaussians, warp: Warp, time: float, factor: float
-    ) -> ImageLoss:
-        """Compare some of them, moved by a warp, with an image."""
-
-
-class Look(NamedTuple):
+class PyramidLevel(NamedTuple):
     """An image in one size: given maps (M, 12) of nodes, ``compare`` returns the gradients (M, 12) by these
     of the loss, and the loss; ``focal`` is the camera's focal length, pixels.
     """
@@ -81,7 +55,7 @@ class Look(NamedTuple):
     focal: float
 
 
-class Sight(NamedTuple):
+class TrackingView(NamedTuple):
     """What bodies are followed in.
 
     Attributes:
@@ -92,62 +66,107 @@ class Sight(NamedTuple):
     """
 
     eye: Tensor
-    looks: Callable[[Tensor], Sequence[Look]]
+    looks: Callable[[Tensor], Sequence[PyramidLevel]]
     again: Callable[[int, Poses], Poses]
 
 
-@torch.no_grad()
-def follow(particles: _Particles, seen: Observation) -> None:
-    """Look for where the bodies of particles are in an image; if that was done, fit their distances at times.
+class BodyTracking(TrainingHook):
+    """Move ``bodies`` of nodes by their poses, up to a share ``until`` of the stage; then fit the curves.
 
     Args:
-        particles: whose bodies lead.
-        seen: a whole training image.
-
-    Cost: about 80 comparisons of small images with what is near bodies; two images are loaded.
+        nodes: in groups, each a body.
+        times: of training images, distinct.
+        until: share of the stage, > 0.
     """
-    nodes, time, camera = particles.deformation.nodes, seen.moment.time, seen.view.camera
-    bodies = nodes.bodies
-    row, number = bodies.row(time), int(_ROUNDS * particles.progress / particles.stage.bodies)
-    known, late = bool(bodies.seen[row]), int(bodies.rounds[row]) < number
-    late &= row != bodies.row(nodes.curve.canonical_time)  # there they are where they were set down
-    bodies.rounds[row] = number
-    if known:
+
+    def __init__(self, nodes: Nodes, times: Sequence[float], until: float) -> None:
+        super().__init__()
+        self.bodies, self.until = Bodies(nodes, times), until
+
+    @property
+    def leads(self) -> bool:
+        """See ``TrainingHook``."""
+        return bool(self.bodies.lead)
+
+    def move(self, time: float, motion: Tensor, maps: Tensor) -> None:
+        """See ``TrainingHook``."""
+        self.bodies.carry(self.bodies.at(time), self.bodies.nodes.positions, motion, maps)
+
+    def gradients(self, time: float, by_maps: Tensor) -> dict[str, Tensor]:
+        """See ``TrainingHook``."""
+        return {"bodies.twists": self.bodies.gradients(time, by_maps)}
+
+    def after_step(self) -> None:
+        """See ``TrainingHook``."""
+        self.bodies.settle()
+
+    def fit_curves(self, nodes: Nodes) -> None:
+        """See ``TrainingHook``."""
+        self.bodies.fit_curves(nodes)
+
+    def param_groups(self) -> dict[str, list[torch.nn.Parameter]]:
+        """See ``TrainingHook``."""
+        return {"node_bodies": [self.bodies.twists]}
+
+    def update(self, particles: Trained, progress: float) -> None:
+        """See ``TrainingHook``."""
+        if progress >= self.until:
+            self.put_on_ground(particles)
+            self.bodies.fit_curves(self.bodies.nodes)
+            self.bodies.lead.fill_(False)
+
+    @torch.no_grad()
+    def before_image(self, particles: Trained, seen: Observation) -> None:
+        """Look for where bodies are in an image; if that was done, fit their distances at times.
+
+        Cost: about 80 comparisons of small images with what is near bodies; two images are loaded.
+        """
+        bodies, time, camera = self.bodies, seen.moment.time, seen.view.camera
+        row, number = bodies.row(time), int(_ROUNDS * particles.progress / self.until)
+        known, late = bool(bodies.seen[row]), int(bodies.rounds[row]) < number
+        # At the canonical time they are where they were set down.
+        late &= row != bodies.row(bodies.nodes.curve.canonical_time)
+        bodies.rounds[row] = number
+        if known:
+            if late:
+                _refit(bodies, particles, seen)
+            return
+        again = partial(_again, bodies, particles, particles.frames, time)
+        eye = camera.center.to(bodies.nodes.positions)
+        image = TrackingView(eye, partial(_looks, bodies, particles, seen), again)
+        found = find(bodies, time, bodies.nodes.positions, image)
+        if not all(bool(part.isfinite().all()) for part in found):
+            found = bodies.at(time)
+        bodies.put(time, found, image.eye)
         if late:
-            _refit(particles, seen)
-        return
-    again = partial(_again, particles, particles.frames, time)
-    image = Sight(camera.center.to(nodes.positions), partial(_looks, particles, seen), again)
-    found = find(bodies, time, nodes.positions, image)
-    if not all(bool(part.isfinite().all()) for part in found):
-        found = bodies.at(time)
-    bodies.put(time, found, image.eye)
-    if late:
-        _refit(particles, seen)
-    load_moving = particles.frames[time].load_moving
-    moving = None if load_moving is None else load_moving()
-    bodies.bring_before(time, _farthest(particles, seen, moving))
+            _refit(bodies, particles, seen)
+        load_moving = particles.frames[time].load_moving
+        moving = None if load_moving is None else load_moving()
+        bodies.bring_before(time, _farthest(bodies, particles, seen, moving))
+
+    @torch.no_grad()
+    def put_on_ground(self, particles: Trained) -> None:
+        """Make bodies as much larger and farther away as they can be before what rests below them: images
+        tell how their distances compare, and little about how far away all of them are.
+        """
+        gaussians, bodies, nodes = particles.gaussians, self.bodies, self.bodies.nodes
+        of, canonical = body_of(particles), bodies.row(nodes.curve.canonical_time)
+        eye = _frame_at(particles.frames, bodies.times[canonical]).camera.center.to(bodies.eyes)
+        times, bodies.eyes[canonical] = bodies.nearest_to_ground(), eye
+        bodies.enlarge(times, eye)
+        own, by = of >= 0, bodies.of_node >= 0
+        gaussians.means[own] = eye + times[of[own], None] * (gaussians.means[own] - eye)
+        gaussians.scales[own] += times[of[own], None].log()
+        nodes.positions[by] = eye + times[bodies.of_node[by], None] * (nodes.positions[by] - eye)
+        nodes.spacing[by] *= times[bodies.of_node[by]]
 
 
-@torch.no_grad()
-def put_on_ground(particles: _Particles) -> None:
-    """Make bodies as much larger and farther away as they can be before what rests below them: images tell
-    how their distances compare, and little about how far away all of them are.
-    """
-    nodes, gaussians, of = particles.deformation.nodes, particles.gaussians, _body_of(particles)
-    bodies = nodes.bodies
-    canonical = bodies.row(nodes.curve.canonical_time)
-    eye = _frame_at(particles.frames, bodies.times[canonical]).camera.center.to(bodies.eyes)
-    times, bodies.eyes[canonical] = bodies.nearest_to_ground(), eye
-    bodies.enlarge(times, eye)
-    own, by = of >= 0, bodies.of_node >= 0
-    gaussians.means[own] = eye + times[of[own], None] * (gaussians.means[own] - eye)
-    gaussians.scales[own] += times[of[own], None].log()
-    nodes.positions[by] = eye + times[bodies.of_node[by], None] * (nodes.positions[by] - eye)
-    nodes.spacing[by] *= times[bodies.of_node[by]]
+def body_tracking(nodes: Nodes, times: Sequence[float], until: float) -> BodyTracking | None:
+    """Return what tracks the bodies that groups of nodes are; None where nodes have no groups."""
+    return None if nodes.groups is None else BodyTracking(nodes, times, until)
 
 
-def find(bodies: Bodies, time: float, positions: Tensor, image: Sight) -> Poses:
+def find(bodies: Bodies, time: float, positions: Tensor, image: TrackingView) -> Poses:
     """Return where bodies are in an image of a time that was not seen, with nodes at rest ``positions``.
 
     They are looked for where they would go on as before or, if that fits a small image better, where they
@@ -166,7 +185,7 @@ def find(bodies: Bodies, time: float, positions: Tensor, image: Sight) -> Poses:
     places = [_carried(bodies, way, positions)[0] for way in (going, resting, again)]
     first, *looks = image.looks(torch.cat(places))
 
-    def compared(look: Look, poses: Poses) -> tuple[Tensor, float]:
+    def compared(look: PyramidLevel, poses: Poses) -> tuple[Tensor, float]:
         by_maps, loss = look.compare(_carried(bodies, poses, positions)[1])
         return bodies.by_twists(poses, by_maps), loss
 
@@ -206,12 +225,11 @@ def fit_distances(poses: Poses, eye: Tensor, compared: Callable[[Poses], float])
     return poses
 
 
-def _refit(particles: _Particles, seen: Observation) -> None:
+def _refit(bodies: Bodies, particles: Trained, seen: Observation) -> None:
     """Fit distances of bodies to an image in which they were found."""
-    nodes, time = particles.deformation.nodes, seen.moment.time
-    bodies, positions = nodes.bodies, nodes.positions
+    positions, time = bodies.nodes.positions, seen.moment.time
     poses, eye = bodies.at(time), seen.view.camera.center.to(positions)
-    (look,) = _looks(particles, seen, _carried(bodies, poses, positions)[0], _SIDES[-1:])
+    (look,) = _looks(bodies, particles, seen, _carried(bodies, poses, positions)[0], _SIDES[-1:])
 
     def compared(poses: Poses) -> float:
         return look.compare(_carried(bodies, poses, positions)[1])[1]
@@ -228,7 +246,7 @@ def _carried(bodies: Bodies, poses: Poses, positions: Tensor) -> tuple[Tensor, T
     return (positions + motion[:, :3])[bodies.of_node >= 0], maps
 
 
-def _slid(bodies: Bodies, poses: Poses, eye: Tensor, look: Look, compared: Callable) -> Poses:
+def _slid(bodies: Bodies, poses: Poses, eye: Tensor, look: PyramidLevel, compared: Callable) -> Poses:
     """Shift bodies to where a small image shows them: by steps along the gradients, as of Adam, but of one
     length in all directions.
     """
@@ -244,7 +262,13 @@ def _slid(bodies: Bodies, poses: Poses, eye: Tensor, look: Look, compared: Calla
 
 
 def _fitted(
-    bodies: Bodies, poses: Poses, start: Poses, eye: Tensor, look: Look, compared: Callable, steps: int
+    bodies: Bodies,
+    poses: Poses,
+    start: Poses,
+    eye: Tensor,
+    look: PyramidLevel,
+    compared: Callable,
+    steps: int,
 ) -> Poses:
     """Fit poses to an image by damped Newton steps that hold them back where they start.
 
@@ -289,13 +313,17 @@ def _fitted(
 
 
 def _looks(
-    particles: _Particles, seen: Observation, places: Tensor, sides: Sequence[int] = _SIDES
-) -> list[Look]:
+    bodies: Bodies,
+    particles: Trained,
+    seen: Observation,
+    places: Tensor,
+    sides: Sequence[int] = _SIDES,
+) -> list[PyramidLevel]:
     """Return an image in some sizes, with the particles that are bodies' or near places (P, 3)."""
     camera, moment, skinning = seen.view.camera, seen.moment, particles.deformation.skinning
     means, _ = moved(particles.gaussians.means, particles.warp(moment.time))
     near = near_places(camera, means, places)
-    near |= _body_of(particles) >= 0
+    near |= body_of(particles) >= 0
     part = Gaussians(*(values[near] for values in particles.gaussians.joined(particles.light(moment))))
     links, weights, looks = skinning.links[near], skinning.weights()[near], []
     for side in sides:
@@ -305,7 +333,7 @@ def _looks(
             found = particles.compared(small, part, Warp(maps, links, weights), moment.time, 1.0)
             return found.maps, found.loss
 
-        looks.append(Look(compare, small.view.camera.fx))
+        looks.append(PyramidLevel(compare, small.view.camera.fx))
     return looks
 
 
@@ -322,16 +350,16 @@ def near_places(camera: Camera, points: Tensor, places: Tensor) -> Tensor:
 
 
 def _again(
-    particles: _Particles, frames: Mapping[float, Frame], time: float, row: int, going: Poses
+    bodies: Bodies, particles: Trained, frames: Mapping[float, Frame], time: float, row: int, going: Poses
 ) -> Poses:
     """Look in the image of a time for what that of a row shows of bodies, around where they then were; the
     farther around, the farther they would be if they went on. Return poses turned as they would be, as far
     from the new eye as they were; what is not found stays where it was.
     """
-    bodies, gaussians = particles.deformation.nodes.bodies, particles.gaussians
+    gaussians = particles.gaussians
     held = Poses(bodies.turns[:, row], bodies.middles[:, row])
     (image, camera), (other, after) = _small(_frame_at(frames, bodies.times[row])), _small(frames[time])
-    of, eye, found = _body_of(particles), after.center.to(held.middles), Poses(going.turns, held.middles)
+    of, eye, found = body_of(particles), after.center.to(held.middles), Poses(going.turns, held.middles)
     was, here, there = (
         view.project(middles)[0].cpu()
         for view, middles in ((camera, held.middles), (after, held.middles), (after, going.middles))
@@ -352,10 +380,10 @@ def _again(
     return found
 
 
-def _body_of(particles: _Particles) -> Tensor:
+def body_of(particles: Trained) -> Tensor:
     """Return the body that each particle is of, (N,); -1: of none, or at rest."""
     skinning = particles.deformation.skinning
-    of = particles.deformation.nodes.bodies.of_node[skinning.links[:, 0].long()]
+    of = particles.deformation.nodes.groups[skinning.links[:, 0].long()]
     return of.where(skinning.shares.sum(-1) > 0, -1)
 
 
@@ -414,11 +442,11 @@ def find_shift(image: Tensor, mask: Tensor, other: Tensor, around: Tensor, reach
     return around + torch.tensor([column - reach, row - reach])
 
 
-def _farthest(particles: _Particles, seen: Observation, moving: Tensor | None) -> Tensor:
+def _farthest(bodies: Bodies, particles: Trained, seen: Observation, moving: Tensor | None) -> Tensor:
     """Return how far away middles of bodies may be in an image, (B,): as what rests is right below each, or
     below the patch of what moves (H, W) that it is alone in, whichever is farther: shadows move, too.
     """
-    bodies, skinning = particles.deformation.nodes.bodies, particles.deformation.skinning
+    skinning = particles.deformation.skinning
     camera = _shrunk(seen.view.camera)
     size = camera.height, camera.width
     whole = particles.at(seen.moment)
@@ -428,7 +456,7 @@ def _farthest(particles: _Particles, seen: Observation, moving: Tensor | None) -
     drawn = part.render(View(camera), torch.zeros(3, device=rests.device)).shaped(*size)
     depth = known_depth(drawn).cpu()
     row, column, shown = where_seen(camera, moved(particles.gaussians.means, whole.warp)[0])
-    of = _body_of(particles)
+    of = body_of(particles)
     own = [shown & (of == body) for body in range(len(bodies))]
     masks = torch.zeros(len(bodies), *size, dtype=torch.bool)
     for mask, which in zip(masks, own):
