@@ -509,6 +509,11 @@ def test_evidence_that_says_little_or_other_things_is_told(tmp_path):
 
 def test_evidence_elsewhere_and_cameras_counted_apart_are_told(tmp_path):
     folder = write_rig(tmp_path / "toy", film())
+    masks = sorted((folder / "covisible" / "2x" / "val").iterdir())
+    masks[0].rename(aside := tmp_path / masks[0].name)
+    told = str(read_scene(tmp_path, "toy").protocol["assumed"])
+    assert f"covisible: masks of {len(masks) - 1} of {len(masks)} test images; {masks[0].name} is" in told
+    aside.rename(masks[0])
     (folder / "covisible" / "2x" / "val").rename(folder / "covisible" / "2x" / "test")
     assert "covisible: none is read, as covisible/2x/test/" in str(
         read_scene(tmp_path, "toy").protocol["assumed"]

@@ -13,6 +13,7 @@ from forewarp.metrics.registry import (
     METRICS,
     ImageSuite,
     Metric,
+    absences,
     described,
     metric_of,
     summarise,
@@ -138,6 +139,15 @@ def test_summary_by_hand():
     assert found == {"space": space, "canonical": {"psnr": 30.0, "ssim": 0.5}}
     assert (list(found), list(found["canonical"])) == (["space", "canonical"], ["psnr", "ssim"])
     assert summarise([]) == {}
+
+
+def test_a_metric_of_some_images_is_named_beside_those_of_none():
+    masked = {"psnr": 30.0, "mpsnr": 31.0, "depth_delta_1.02": 1.0}
+    absent = absences([masked, masked, {"psnr": 20.0}], {"ssim": "small", "depth_delta_1.02": "empty"})
+    assert (list(absent), absent["ssim"]) == (["ssim", "depth_delta_1.02", "mpsnr"], "small")
+    assert absent["mpsnr"].startswith("only of 2 of 3 images")
+    assert absent["depth_delta_1.02"].endswith(": empty")
+    assert absences([masked, masked], {}) == {}
 
 
 @pytest.mark.parametrize(

@@ -524,8 +524,8 @@ def _are_normalised(points: np.ndarray, poses: Sequence[Tensor], world: Normalis
 
 
 def _doubt_evidence(folder: Path, scale: int, train: Sequence[Frame], test: Sequence[Frame]) -> list[str]:
-    """Say in lines that co-visible masks or keypoints are there and none is read, and that keypoints are not
-    in pixels of the images.
+    """Say in lines that co-visible masks or keypoints are there and none is read, that some test images lack
+    such masks, and that keypoints are not in pixels of the images.
     """
     lines = []
     for kind, used in (
@@ -536,6 +536,11 @@ def _doubt_evidence(folder: Path, scale: int, train: Sequence[Frame], test: Sequ
         if found is not None and not used:
             advice = f"with data.scale={scale} they lie in {kind}/{scale}x/, in a folder of the split's name"
             lines.append(f"{folder / kind}: none is read, as {found.relative_to(folder)}; {advice}")
+    without = [f.name for f in test if f.load_covisible is None]
+    if 0 < len(without) < len(test):
+        count = f"{len(test) - len(without)} of {len(test)}"
+        said = f"masks of {count} test images; {without[0]}.png is not there"
+        lines.append(f"{folder / 'covisible'}: {said}: masked metrics are means over the others alone")
     seen = [
         f.keypoints[f.keypoints[:, 2] > 0, :2] / torch.tensor([f.camera.width, f.camera.height])
         for f in keyed

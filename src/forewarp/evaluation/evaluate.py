@@ -24,7 +24,7 @@ from forewarp.files import write_json
 from forewarp.methods.effect import switched
 from forewarp.methods.method import CarriesPixels, HasEllipsoids, HasLayers, HasTrajectories, parameter_count
 from forewarp.metrics.geometry import end_point_error
-from forewarp.metrics.registry import METRICS, ImageSuite, described, scores_of_parts, summarise
+from forewarp.metrics.registry import METRICS, ImageSuite, absences, described, scores_of_parts, summarise
 from forewarp.ops.grid import block_means, reduced_depth
 from forewarp.progress import TextConsole, time_text
 from forewarp.provenance import versions
@@ -179,8 +179,8 @@ def evaluate(
     if trust := trust_of(module.method, scene, whole, chosen, drop_of(metrics["test"])):
         metrics["trust"] = trust
     metrics["metrics"] = described(dict.fromkeys(n for scores in metrics["test"].values() for n in scores))
-    if suite.absent:
-        metrics["absent"] = dict(suite.absent)
+    if lacking := absences([row["scores"] for row in per_image], suite.absent):
+        metrics["absent"] = lacking
     if targets := [done["target"] for done in finished.values() if "target" in done]:
         metrics["target"] = targets[-1]
     for name in others:

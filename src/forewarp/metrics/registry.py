@@ -5,7 +5,8 @@ from __future__ import annotations
 import json
 import logging
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -305,6 +306,26 @@ def summarise(rows: Iterable[tuple[str, Mapping[str, float]]]) -> dict[str, dict
         for ability, found in collected.items()
         if found
     }
+
+
+def absences(scores: Sequence[Mapping[str, float]], reasons: Mapping[str, str]) -> dict[str, str]:
+    """Say which metrics all images lack, or some of them, and why; log those that nothing was said of.
+
+    Args:
+        scores: of each image.
+        reasons: why images lack metrics, where that is known.
+
+    >>> absences([{"psnr": 30.0, "mpsnr": 31.0}, {"psnr": 29.0}], {"lpips_vgg": "no weights"})
+    {'lpips_vgg': 'no weights', 'mpsnr': 'only of 1 of 2 images, so it is no mean over the same as others'}
+    """
+    found = Counter(name for each in scores for name in each)
+    absent = dict(reasons)
+    for name in (name for name in METRICS if 0 < found[name] < len(scores)):
+        line = f"only of {found[name]} of {len(scores)} images, so it is no mean over the same as others"
+        absent[name] = f"{line}: {reasons[name]}" if name in reasons else line
+        if name not in reasons:
+            log.warning("%s: %s", name, line)
+    return absent
 
 
 def _reason(name: str, target: Target) -> str:

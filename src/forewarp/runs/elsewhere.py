@@ -23,7 +23,7 @@ from forewarp.evaluation.evaluate import from_training, middles, show, write_she
 from forewarp.files import MOST_IMAGE, load_yaml, read_bytes, refuse_links, replace_file, write_json
 from forewarp.media import open_image
 from forewarp.metrics.lpips import find_lpips
-from forewarp.metrics.registry import ImageSuite, described, scores_of_parts, summarise
+from forewarp.metrics.registry import ImageSuite, absences, described, scores_of_parts, summarise
 from forewarp.progress import Counted
 from forewarp.provenance import versions
 from forewarp.runs.build import frames_folder
@@ -300,8 +300,8 @@ def measure_renders(
         "test": test,
         "metrics": described(dict.fromkeys(name for of_kind in test.values() for name in of_kind)),
     }
-    if suite.absent:
-        metrics["absent"] = dict(suite.absent)
+    if lacking := absences([row["scores"] for row in rows], suite.absent):
+        metrics["absent"] = lacking
     write_json(folder / "per_image.json", {"images": rows})
     write_json(folder / "metrics.json", metrics)
     return metrics
