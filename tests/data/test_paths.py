@@ -50,6 +50,8 @@ def test_rounded_times_of_one_path_are_said_and_not_those_of_a_rig(count):
     assert line.startswith("16 images of one camera's path have 10 times (images/frame_2 and images/frame_3")
     rig = film(times=[i // 4 / 4 for i in range(COUNT)], cameras=CAMERAS[::4] * 4)
     assert not said(rig, "times (")
+    assert not said(rig[:-1], "times (")
+    assert not said(film(times=[i // 2 / 8 for i in range(COUNT)]), "times (")  # two cameras on one path
     assert not said(film(), "times (")
 
 

@@ -35,6 +35,7 @@ _STRETCHED, _SAME_PLACE = 1.25, 1e-9  # sides of a pixel; share of the cameras' 
 _AROUND = 2  # half a side of a subject's box in distances of the farthest camera from what they look at
 _WALKED, _SLOW = 5, 1  # degrees around what a film shows, in all and a second, that are too few
 _FAR_PAIRS = 8  # of a film around a subject
+_LEAST_VIEWS = 8  # whose silhouettes tell focal lengths
 _VIEWS, _FACTORS = 12, (16 / 9, 9 / 16, 0.5, 0.75, 4 / 3, 2.0)  # images; focal lengths, the likeliest first
 _LIKELIER, _MISSED = 0.8, 0.01  # pixels outside other silhouettes: share of those as read, and less by these
 _LONGER = "if focal lengths are {:.3g} times as long"
@@ -366,7 +367,7 @@ def _silhouettes(scene: Scene, aim: Tensor | None, *, bounded: bool) -> Iterator
     if missed > _CUT_OFF * total:
         line = f"{missed / total:.0%} of the subject's pixels see nothing of the box {bounds(scene)}"
         yield f"{line} between near and far; {_remedy(scene, 'all')}"
-    elif aim is not None:
+    elif aim is not None and len(scene.train) >= _LEAST_VIEWS:
         yield from _other_focal(scene, aim)
 
 

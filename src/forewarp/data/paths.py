@@ -35,10 +35,9 @@ def doubt_paths(scene: Scene) -> Iterator[str]:
 
     Cost: nothing is decoded but some images on both sides of a pose that is repeated.
     """
-    trained = (*scene.train, *scene.held)
-    everything, trained = (_of_cameras(some) for some in ((*trained, *scene.val, *scene.test), trained))
+    everything = _of_cameras((*scene.train, *scene.held, *scene.val, *scene.test))
     still = [] if scene.has_alpha else everything  # where a background tells whether the camera moves
-    for doubt, cameras in ((_out_of_order, everything), (_rounded, trained), (_repeated, still)):
+    for doubt, cameras in ((_out_of_order, everything), (_rounded, everything), (_repeated, still)):
         yield from filter(None, [next(filter(None, map(doubt, cameras)), None)])
 
 
@@ -95,7 +94,8 @@ def _rounded(frames: Sequence[Frame]) -> str | None:
     for frame in in_order(frames, lambda frame: frame.name):
         blocks.setdefault(frame.time, []).append(frame)
     are_few = len(frames) - len(blocks) <= _SHARED * len(frames)
-    if are_few or len(blocks) < _LEAST_TIMES or [*blocks] != sorted(blocks):
+    is_rig = len({*map(len, blocks.values())}) == 1
+    if are_few or is_rig or len(blocks) < _LEAST_TIMES or [*blocks] != sorted(blocks):
         return None
     ends = [_places([one[0], one[-1], other[0]]) for one, other in pairwise(blocks.values())]
     again, on = (sum(float((end[k] - end[2]).norm()) for end in ends) for k in (0, 1))
