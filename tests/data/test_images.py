@@ -9,6 +9,7 @@ import pytest
 import torch
 from PIL import Image
 
+from forewarp.data.files import SceneError
 from forewarp.data.images import (
     _OWN_PAGES,
     CACHE,
@@ -22,6 +23,7 @@ from forewarp.data.images import (
     read_gray16,
     read_image,
     reduced,
+    refuse_other_sizes,
     write_image,
 )
 from tests.support.written_scenes import refused
@@ -259,3 +261,40 @@ def test_a_jpeg_with_a_second_image_inside_is_turned_as_others(tmp_path):
     header = inspect_image(tmp_path / "a.jpg")
     assert (header.size, header.is_turned) == ((53, 37), True)
     assert read_image(tmp_path / "a.jpg", upright=True).shape == (53, 37, 4)
+
+
+def films(folder, suffix, images):
+    folder.mkdir()
+    paths = [folder / f"{i}{suffix}" for i in range(len(images))]
+    for path, pixels in zip(paths, images):
+        write_image(path, pixels)
+    return paths
+
+
+def test_smaller_images_of_an_earlier_extraction_are_refused(tmp_path):
+    random = np.random.default_rng(0)
+    wide = Image.fromarray(random.integers(0, 255, (18, 30, 3), dtype=np.uint8)).resize((300, 180))
+    wide = np.asarray(wide).astype(float) + random.normal(0, 12, (180, 300, 1))  # a texture below any filter
+    wide = wide.clip(0, 255).astype(np.uint8)
+    moments = [wide[20:116, 4 * i : 4 * i + 128] for i in range(12)]  # of a camera that turns
+    full = films(tmp_path / "images", ".png", moments[:8])
+    resized = lambda x, filter: np.asarray(Image.fromarray(x).resize((64, 48), filter))  # noqa: E731
+    graded = lambda x: (255 * (x / 255.0) ** 0.8 * [1, 0.9, 0.95]).astype(np.uint8)  # noqa: E731
+    for filter in (Image.BOX, Image.NEAREST, Image.LANCZOS, Image.BILINEAR):
+        for how in (lambda x: x, graded):
+            small = [how(resized(x, filter)) for x in moments]
+            folder = tmp_path / f"{filter}_{how is graded}"
+            refuse_other_sizes(full, films(folder, ".jpg", small[:8]))
+    refuse_other_sizes(full, films(tmp_path / "strided", ".png", [x[::2, ::2] for x in moments[:8]]))
+    for later, said in ((1, ", nearer to 1.png .*; make images_1 again"), (4, "")):
+        small = [resized(x, Image.BOX) for x in moments[later:]]
+        earlier = films(tmp_path / f"images_{later}", ".png", small)
+        with pytest.raises(SceneError, match="expected images/0.png at a .*, but got another image" + said):
+            refuse_other_sizes(full, earlier)
+    subject = np.zeros((96, 160), np.uint8)
+    subject[20:70, 10:50] = 255
+    masks = films(tmp_path / "masks", ".png", [np.roll(subject, 6 * i, 1) for i in range(8)])
+    small = [np.roll(subject, 6 * i, 1)[::2, ::2] for i in range(12)]
+    refuse_other_sizes(masks, films(tmp_path / "strided_masks", ".png", small[:8]), are_masks=True)
+    with pytest.raises(SceneError, match="expected masks/0.png at a smaller size"):
+        refuse_other_sizes(masks, films(tmp_path / "masks_2", ".png", small[4:]), are_masks=True)

@@ -70,6 +70,7 @@ from forewarp.data.images import (
     exif_turned,
     inspect_image,
     mixed_linear,
+    refuse_other_sizes,
     write_image,
 )
 from forewarp.data.names import in_order, read_names
@@ -197,6 +198,9 @@ def read_scene(
     paths = {item: with_suffix(inside(images, item, where)) for item in ids}
     there, told = with_images(ids, list(paths.values()), where)
     advice = "remove those that are not meant"
+    if scale > 1:
+        largest = [images.with_name("1x") / paths[item].name for item in there]
+        refuse_other_sizes(largest, [paths[item] for item in there])
     assumed += [*told, *beside_images([paths[item] for item in there], where, advice)]
     train_ids, test_ids = ([item for item in part if item in set(there)] for part in (train_ids, test_ids))
     for part, names in (("train_ids", train_ids), ("val_ids", test_ids)):

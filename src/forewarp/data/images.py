@@ -10,6 +10,7 @@ from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from hashlib import sha256
 from pathlib import Path
 from typing import BinaryIO
@@ -48,6 +49,9 @@ _ROUNDED, _STRAY, _LEAST_EDGES, _EDGES_OF = 2, 0.001, 50, 4  # of an edge; share
 _FOREGROUND = 127  # a mask above it is foreground; masks are lossy, so never quite 0 or 255
 _COLORED = 32  # of 255: difference of channels of a mask with colours; all of a DAVIS palette are as bright
 _OWN_PAGES = 1 << 20  # bytes of a kept tensor from which it has pages of its own
+_COMPARED, _REDUCED_SIDE, _LEAST_BLOCKS = 3, 64, 200  # images with smaller copies; blocks of each
+_REDUCED, _REDUCED_MASK = 3, 16  # of 255: a difference that filters and codecs leave, of masks at their edges
+_OTHER, _OWN = 60, 0.5  # of 255: difference of another image; share of that to one beside it
 _NUMBERED = 15  # a mask nowhere above it holds numbers of objects
 _LABELS = 32  # levels of grey, or fewer, that may be those of objects
 
@@ -334,6 +338,74 @@ def is_premultiplied(images: Iterable[Tensor]) -> bool | None:
     if max(telling, above) < _LEAST_EDGES:
         return None
     return telling >= _LEAST_EDGES and above <= _STRAY * telling
+
+
+def refuse_other_sizes(whole: Sequence[Path], small: Sequence[Path], *, are_masks: bool = False) -> None:
+    """Refuse smaller copies of images that are of other images, such as those of an earlier extraction.
+
+    A few are compared with theirs, whatever filter made them smaller and whatever was done to colours.
+
+    Args:
+        whole: files of the full size, in the order of what they show; one that is not there is passed over.
+        small: the copy of each.
+        are_masks: they are masks.
+
+    Raises:
+        SceneError: naming a copy that differs from its image by more than filters and codecs do, and that
+            is as near to one beside it.
+
+    Cost: six images are decoded; up to six more, where one differs.
+    """
+    pairs = [
+        (big, little)
+        for big, little in zip(whole, small)
+        if big != little and big.is_file() and little.is_file()
+    ]
+
+    def read(path: Path) -> Tensor:
+        if not are_masks:
+            return read_image(path)
+        mask = (bright(path) * 255).to(torch.uint8)[..., None].expand(-1, -1, 3)
+        return torch.cat([mask, torch.full_like(mask[..., :1], 255)], -1)
+
+    least = _REDUCED_MASK if are_masks else _REDUCED
+    for i in spread(len(pairs), _COMPARED):
+        big, little = pairs[i]
+        copy = read(little)
+        own = _reduced_error(read(big), copy, least)
+        beside = {pairs[j][0] for j in (i - 1, i + 1) if 0 <= j < len(pairs)} - {big} if own > least else ()
+        errors = {path: _reduced_error(read(path), copy, least) for path in sorted(beside)}
+        nearest = min(errors, key=errors.get, default=None)
+        if own > _OTHER or (nearest is not None and own > _OWN * errors[nearest]):
+            like = f", nearer to {nearest.name}" if nearest is not None and errors[nearest] < own else ""
+            expected = f"{big.parent.name}/{big.name} at a smaller size"
+            advice = f"make {little.parent.name} again from {big.parent.name}, or set data.scale=1"
+            raise mismatch(little, expected, f"another image{like} ({own:.0f} of 255 apart)", advice)
+
+
+def _reduced_error(whole: Tensor, small: Tensor, enough: float) -> float:
+    """Return by how much of 255 an image and a smaller copy, uint8 (H, W, 4), differ where both are opaque:
+    averaged over blocks, colours fitted, by the likeliest filter or the first with a difference of at most
+    ``enough``; 0 where too little is left.
+    """
+    planes, copy = (rgba.permute(2, 0, 1)[None].float() for rgba in (whole, small))
+    size = small.shape[:2]
+    blocks = [max(1, n // max(2, max(size) // _REDUCED_SIDE)) for n in size]
+    area = partial(torch.nn.functional.interpolate, size=blocks, mode="area")
+    copy, least = area(copy)[0].flatten(1).T.double(), float("inf")
+    for mode in ("area", "nearest", "nearest-exact", "bilinear"):
+        found = area(torch.nn.functional.interpolate(planes, tuple(size), mode=mode))[0].flatten(1).T.double()
+        shown = (found[:, 3] > 254) & (copy[:, 3] > 254)
+        if int(shown.sum()) < _LEAST_BLOCKS:
+            return 0.0
+        colors = found[shown, :3] / 255
+        terms = torch.cat([torch.ones_like(colors[:, :1]), colors, colors**2], 1).numpy()
+        there = copy[shown, :3].numpy()
+        rest = there - terms @ np.linalg.lstsq(terms, there, rcond=None)[0]
+        least = min(least, float(np.sqrt((rest**2).mean())))
+        if least <= enough:
+            break
+    return least
 
 
 def alpha_of(

@@ -64,6 +64,7 @@ from forewarp.data.images import (
     hides_image,
     inspect_image,
     mixed_linear,
+    refuse_other_sizes,
     write_image,
 )
 from forewarp.data.names import in_order, read_names
@@ -359,6 +360,13 @@ def _read_entries(
     """
     images, assumed = read_frames(file, content, axes=axes, inverse=inverse, scale=scale)
     entries, has_mask, dark = [], [], []
+    for key in ("mask_path", "moving_path", "resting_path") if scale > 1 else ():
+        if key == "mask_path" and masks == "off":
+            continue
+        named = [image for image in images if image.entry.get(key) is not None]
+        small = [_mask_of(image, key, scale) for image in named]
+        full = [image_of(image.entry, key) for image in named]
+        refuse_other_sizes(full, small, are_masks=True)
     for image in images:
         mask, valid, entry, has_alpha = None, None, image.entry, image.header.has_alpha
         if masks != "off":

@@ -36,7 +36,7 @@ from forewarp.data.files import (
     one_of,
     side_files,
 )
-from forewarp.data.images import TURN, Header, by, exif_turned, inspect_image, same_files
+from forewarp.data.images import TURN, Header, by, exif_turned, inspect_image, refuse_other_sizes, same_files
 from forewarp.data.names import LEAST_SPAN, in_order, name_parts, read_names, refuse_far
 from forewarp.ops.backend import is_number
 from forewarp.scene.camera import Camera, Lens
@@ -133,6 +133,9 @@ def read_frames(
     if optional and not any(map(os.path.isfile, paths)):
         return [], [f"{file}: none of its {len(paths)} images is there: left out", *unread]
     there, assumed = with_images(list(zip(entries, paths)), paths, str(file))
+    if scale > 1:
+        whole = [image_of(entry, "file_path") for entry, _ in there]
+        refuse_other_sizes(whole, [path for _, path in there])
     images = []
     for entry, path in there:
         header, pose = inspect_image(path), pose_in(entry, axes, inverse)
