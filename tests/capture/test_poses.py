@@ -81,6 +81,25 @@ def test_a_model_is_found_where_colmap_and_nerfstudio_put_it(tmp_path, place):
     assert read_model(tmp_path).cameras.keys() == cameras.keys()
 
 
+@pytest.mark.parametrize(
+    ("name", "empty"), [("{}.png", False), ("{}", False), ("my {}.png", False), ("{}", True)]
+)
+def test_a_model_without_the_second_line_of_its_images_is_refused(tmp_path, name, empty):
+    cameras = {name.format(i): camera for i, camera in enumerate(cameras_on_arc(4).values())}
+    write_model(tmp_path / "m", cameras, POINTS)
+    file = tmp_path / "m" / "images.txt"
+    file.write_text(
+        "# images\n" + ("\n" * (1 + empty)).join(file.read_text().split("\n")[::2]) + "\n" * empty
+    )
+    (tmp_path / "m" / "points3D.txt").write_text("")
+    if empty:
+        assert len(read_model(tmp_path / "m").cameras) == 4
+        return
+    expected = "expected two lines an image .the second may be empty., but got poses in line 2 and 3"
+    with pytest.raises(ValueError, match=f"images.txt: {expected}"):
+        read_model(tmp_path / "m")
+
+
 @pytest.mark.parametrize("end", ["\n", "\r\n"])
 def test_names_with_blanks_are_whole(tmp_path, end):
     cameras = {f"my frame {name}": camera for name, camera in cameras_on_arc(3).items()}

@@ -200,20 +200,43 @@ def _stored(folder: Path, kind: str) -> pycolmap.Reconstruction:
     for file in files:
         with opened(file, MOST_FILM):
             pass
-    model = pycolmap.Reconstruction()
+    model, rows = pycolmap.Reconstruction(), _rows(files[1]) if kind == "txt" else []
     try:
         with memory_within(_ROOM + 20 * sum(file.stat().st_size for file in files)):  # it believes lengths
             (model.read_binary if kind == "bin" else model.read_text)(folder)
-        if kind == "txt":  # of a name with blanks it took what is before the first
-            with files[1].open(encoding="utf-8", errors="replace") as lines:
-                rows = (line.split(maxsplit=9) for line in lines if line.strip() and line.lstrip()[0] != "#")
-                for row in rows:
-                    model.images[int(row[0])].name = row[9].rstrip()
-                    next(lines, None)  # its points, or an empty line
+        for row in rows:  # of a name with blanks it took what is before the first
+            model.images[int(row[0])].name = row[9].rstrip()
     except (RuntimeError, ValueError, LookupError, OverflowError, MemoryError) as error:
         text = (str(error).strip().splitlines() or ["a file that cannot be read"])[-1]
         raise mismatch(folder, "a COLMAP model", text, "export it again") from error
     return model
+
+
+def _rows(file: Path) -> list[list[str]]:
+    """Split the first line of each image in ``images.txt``; SceneError where its second one is missing."""
+    rows = []
+    with file.open(encoding="utf-8", errors="replace") as lines:
+        numbered = enumerate(lines, 1)
+        for number, line in numbered:
+            if not line.strip() or line.lstrip()[0] == "#":
+                continue
+            rows.append(line.split(maxsplit=9))
+            points = next(numbered, (0, ""))[1].split(
+                maxsplit=10
+            )  # of each three numbers; the line may be empty
+            if len(points) == 10 or (len(points) > 10 and not _is_number(points[10].split()[-1])):
+                expected = "two lines an image (the second may be empty)"
+                got = f"poses in line {number} and {number + 1}"
+                raise mismatch(file, expected, got, "add an empty line after each that has none")
+    return rows
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
 
 
 def _differing(model: pycolmap.Reconstruction, other: pycolmap.Reconstruction) -> str | None:
