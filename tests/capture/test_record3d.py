@@ -84,6 +84,13 @@ def test_a_scan_becomes_a_scene_with_its_poses_and_depth(tmp_path):
     assert read_scene(tmp_path, "a", scale=2, normalise=False).train[0].load().shape == (24, 18, 4)
 
 
+def test_a_scan_without_poses_is_said(tmp_path):
+    still = write_scan(tmp_path / "still.r3d", 5, poses=[[0.0, 0, 0, 1, 1, 2, 3]] * 5)
+    lines = summary(captured(still, tmp_path / "still"))
+    assert lines[2].startswith("cameras all stand in one place, which tells nothing of depth; compare their")
+    assert len(summary(captured(write_scan(tmp_path / "a.r3d", 5), tmp_path / "a"))) == 2
+
+
 def test_frames_may_be_fewer_and_have_times_and_lenses_of_their_own(tmp_path):
     stamps, lenses = [0.0, 0.1, 0.3, 0.4, 1.0], [[40.0 + i, 41, 18, 24] for i in range(5)]
     own = {"frameTimestamps": stamps, "perFrameIntrinsicCoeffs": lenses, "rgbd/4.conf": None}

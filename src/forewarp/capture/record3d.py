@@ -25,6 +25,7 @@ import torch
 from forewarp.capture.frames import Step, write_smaller
 from forewarp.data.agreement import likeliest_reading, small_image
 from forewarp.data.cameras import check_camera
+from forewarp.data.checks import IN_ONE_PLACE, are_one_place
 from forewarp.data.depth import SHOWN, along_rays
 from forewarp.data.directions import opposite
 from forewarp.data.files import Entry, mismatch
@@ -90,6 +91,8 @@ def capture_record3d(scan: Path, out: Path, step: Step, mark: str, frames: int |
             facts = {"source": str(scan), "pictures": len(chosen), "found": len(read.poses)}
             facts |= {"size": list(read.size), "depth": list(read.of_depth), "seconds": last - first}
             facts |= {"near": near, "far": far, "w_first": read.w_first}
+            places = torch.tensor([read.poses[i][4:] for i in chosen], dtype=torch.float64)
+            facts["in_one_place"] = are_one_place(places)
             write_json(folder / mark, facts)
     return facts
 
@@ -98,9 +101,11 @@ def summary(facts: dict) -> list[str]:
     """Say what was found in a few lines."""
     size, of_depth, near, far = by(facts["size"]), by(facts["depth"]), facts["near"], facts["far"]
     order = "; quaternions are w, x, y, z, as neighbouring views agree so" if facts["w_first"] else ""
+    still = f"cameras {IN_ONE_PLACE}; scans by the front camera have none"
     return [
         f"frames: {facts['pictures']} of {facts['found']}, {size} pixels, {facts['seconds']:.1f} s",
         f"depth: {of_depth}, near {near:.2f} and far {far:.2f} metres; poses are the phone's{order}",
+        *[still] * facts["in_one_place"],
     ]
 
 

@@ -32,6 +32,7 @@ _ASIDE = 0.25  # share of a side by which a principal point is far from the midd
 _CROPPED, _MIDDLE = 0.08, 0.01  # shares by which one of a crop is off; and the other, of one side alone
 _CORNER = 0.05  # shares of the sides from the corner, which are rather from the middle
 _STRETCHED, _SAME_PLACE = 1.25, 1e-9  # sides of a pixel; share of the cameras' distance from the origin
+IN_ONE_PLACE = "all stand in one place, which tells nothing of depth; compare their poses"
 _AROUND = 2  # half a side of a subject's box in distances of the farthest camera from what they look at
 _WALKED, _SLOW = 5, 1  # degrees around what a film shows, in all and a second, that are too few
 _FAR_PAIRS = 8  # of a film around a subject
@@ -131,13 +132,19 @@ def remarks(scene: Scene) -> Iterator[str]:
             yield f"{line}, as if they were in other units or axes; remove them, or write them anew"
 
 
+def are_one_place(places: torch.Tensor) -> bool:
+    """Tell whether several cameras' places (C, 3) are the same."""
+    apart = float((places - places[0]).abs().max())
+    return len(places) > 1 and apart <= _SAME_PLACE * float(places.abs().max())
+
+
 def _pinholes(scene: Scene) -> Iterator[str]:
     """Say that cameras stand in one place, have their middle far aside or no square pixels, or see more than
     a pinhole camera shows.
     """
     places = torch.stack([frame.camera.center for frame in scene.train])
-    if len(places) > 1 and float((places - places[0]).abs().max()) <= _SAME_PLACE * float(places.abs().max()):
-        yield "training cameras all stand in one place, which tells nothing of depth; compare their poses"
+    if are_one_place(places):
+        yield f"training cameras {IN_ONE_PLACE}"
     cameras = [frame.camera for frame in scene.train]
     across = float(torch.tensor([camera.cx / camera.width for camera in cameras]).median())
     down = float(torch.tensor([camera.cy / camera.height for camera in cameras]).median())
