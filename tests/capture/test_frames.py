@@ -253,7 +253,9 @@ def test_linear_and_equal_images_of_a_folder_are_told(tmp_path):
     say_linear(pictures / "3.png")
     told = take(tmp_path, Source(images=pictures), step, None, None).assumed
     assert "1 of 4 images say that they are linear (gAMA 1; 3.png, ..)" in told
-    assert f"{pictures}: 1 of 4 images are the same file as others (0.png and 1.png, ..); leave" in told
+    assert (
+        f"{pictures}: 1 of 4 images are the same file as others (0.png and 1.png, ..); leave copies" in told
+    )
 
 
 @pytest.mark.parametrize("frame", ["dark above", "uneven", "soft"])

@@ -66,7 +66,8 @@ def remarks(scene: Scene) -> Iterator[str]:
     Raises:
         SceneError: if no training image shows anything.
 
-    Cost: eight training images are decoded, which training does anyway; all, where those show nothing.
+    Cost: eight training images are decoded, which training does anyway, of cut-outs up to forty for their
+    silhouettes; all, where those show nothing.
     """
     aim = common_point([frame.camera.camera_to_world for frame in scene.train])
     aside = list(_pinholes(scene)) or list(_too_wide(scene, aim))
@@ -272,7 +273,8 @@ def _turned_poses(scene: Scene, aimed: bool) -> Iterator[str]:
         how = likeliest(mine, others)
         if how is None:
             return
-    yield f"neighbouring images agree much better {how}; compare poses and focal lengths with others"
+    which = "images of different directions" if aimed else "neighbouring images"
+    yield f"{which} agree much better {how}; compare poses and focal lengths with others"
 
 
 def _zoomed(camera: Camera, factor: float) -> Camera:

@@ -280,9 +280,12 @@ def doubt_depths(
     _settle_levels([frame.load_sensed for frame in frames])
     if kind not in (*METRIC, None) or not frames:
         return []
-    if how := _apart([frame.load_sensed for frame in frames]):
-        return [f"{where}: depths of different images seem to have different units, as {how}; {stretched}"]
     limits = _settle_ends([frame.load_sensed for frame in frames], where)
+    if how := _apart([frame.load_sensed for frame in frames]):
+        return [
+            f"{where}: depths of different images seem to have different units, as {how}; {stretched}",
+            *limits,
+        ]
     loads = [frames[i].load_sensed for i in spread(len(frames), _LOOKED_AT)]
     near, far = loads[0].camera.near / world, loads[0].camera.far / world
     holes, kept, pixels = {"the largest of their type": [], f"beyond far, {far:.4g}": []}, [], 0
@@ -689,9 +692,7 @@ def unit_of(paths: Sequence[Path], near: float, far: float) -> tuple[float, list
             return unit, [] if unit == 1 else [f"{paths[0].parent}: {line}"]
     ends = [_end_of_range(_numbers_in(paths[i])) for i in spread(len(paths), _LOOKED_AT)]
     if len(ends) >= _FITTED and None not in ends:
-        got = (
-            f"ones of which the largest of each image is {max(ends):.6g}, as if each was stretched to a range"
-        )
+        got = f"ones whose largest is {max(ends):.6g} in each image, as if each was stretched to a range"
         raise mismatch(paths[0].parent, "depths of one unit", got, "write them so, or set data.depth=null")
     expected = f"depths between near and far, {near:.4g} and {far:.4g} in the cameras' unit, or thousandths"
     advice = f"multiply them by {fitting_unit(median, near, far)}"

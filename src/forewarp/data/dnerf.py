@@ -18,7 +18,6 @@ import os
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from operator import attrgetter
 from pathlib import Path
 
 import numpy as np
@@ -280,7 +279,7 @@ def _read_records(
     records = {split: [replace(record, time=next(each)) for record in records[split]] for split in SPLITS}
     if not records["test"]:
         ordered = sorted(records["train"], key=lambda record: record.time)
-        records["train"], records["test"] = hold_out_every(ordered, test_every, attrgetter("path"))
+        records["train"], records["test"] = hold_out_every(ordered, test_every)
         line = f"{folder}: no test images: every {test_every}th training image is tested on instead"
         assumed.append(f"{line} ({len(records['test'])}; data.test_every)")
         if not records["test"]:

@@ -189,8 +189,8 @@ def mixed_linear(headers: Mapping[Path, Header], where: object) -> list[str]:
     return [f"{where}: {line}, and all are read as sRGB; write all alike"]
 
 
-def same_files(paths: Iterable[Path]) -> list[list[Path]]:
-    """Group files that are the same byte for byte, in the order given; a file without a copy is left out.
+def copies(paths: Sequence[Path], tested: Collection[Path] = ()) -> list[str]:
+    """Say in a line that some images are copies of others, and how many of those are ``tested`` on.
 
     Cost: one look at the size of each, one read of those that share it.
     """
@@ -200,19 +200,13 @@ def same_files(paths: Iterable[Path]) -> list[list[Path]]:
     same: dict[bytes, list[Path]] = {}
     for path in (path for some in of_size.values() if len(some) > 1 for path in some):
         same.setdefault(sha256(read_bytes(path, MOST_IMAGE, "an image")).digest(), []).append(path)
-    return [some for some in same.values() if len(some) > 1]
-
-
-def copies(paths: Sequence[Path], tested: Collection[Path] = ()) -> list[str]:
-    """Say in a line that some images are copies of others, and how many are so that are ``tested`` on."""
-    if not (groups := same_files(paths)):
+    if not (groups := [some for some in same.values() if len(some) > 1]):
         return []
     count, (one, other) = sum(map(len, groups)) - len(groups), groups[0][:2]
     line = f"{count} of {len(paths)} images are the same file as others ({one.name} and {other.name}, ..)"
     both = sum(path in tested for some in groups if not {*some} <= {*tested} for path in some)
-    if both:
-        return [f"{line}; {both} to test on are trained on, too: their scores say little"]
-    return [f"{line}; leave them out, unless nothing moved meanwhile"]
+    leaked = f"; {both} to test on are trained on, too: their scores say little" if both else ""
+    return [f"{line}{leaked}; leave copies out, unless nothing moved meanwhile"]
 
 
 def common_header(paths: Iterable[Path], one_size: bool = True) -> tuple[Header, dict[Path, Header]]:
@@ -550,9 +544,12 @@ def bright(path: Path, size: tuple[int, int] | None = None, of_alpha: bool = Fal
         of_alpha: the mask is the alpha of this image.
 
     Raises:
-        SceneError: as ``read_image``.
+        SceneError: as ``read_image``, and where it is not as large as ``size`` or so many times as large.
     """
     rgba = read_image(path)
+    times = max(1, round(rgba.shape[1] / size[0])) if size else 1
+    if size and any(abs(n - stored / times) >= 1 for n, stored in zip(size, rgba.shape[1::-1])):
+        raise mismatch(path, f"{by(size)} pixels", by(rgba.shape[1::-1]))
     if not of_alpha and bool((rgba[..., 3] < 255).any()):
         colors, inside = rgba[..., :3].reshape(-1, 3), rgba[rgba[..., 3] > _FOREGROUND][:, :3]
         of_alpha = bool((colors == colors[0]).all()) or any(map(_are_of_image, (colors, inside)))

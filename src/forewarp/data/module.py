@@ -17,7 +17,7 @@ from forewarp.data.batches import Sampler, Targets, color_of
 from forewarp.data.checks import check_seen
 from forewarp.data.files import RECORD, fingerprint, mismatch, one_of, whole
 from forewarp.data.films import STORE, films_of
-from forewarp.data.images import CACHE, StoredImage, same_files
+from forewarp.data.images import CACHE
 from forewarp.data.windows import cut
 from forewarp.ops.backend import is_number
 from forewarp.scene.frame import Scene, Truth, middle_of, spread
@@ -35,7 +35,7 @@ def hold_out(scene: Scene, count: int) -> Scene:
 
     The first and the last time and the canonical one keep all their frames: nothing lies beyond what was seen
     to compare with, and a stage starts from the canonical time. Where there is only one time, any of its
-    frames may be held out. Frames whose image is the same file as one that is held out go with it.
+    frames may be held out.
 
     Args:
         scene: as read.
@@ -52,10 +52,6 @@ def hold_out(scene: Scene, count: int) -> Scene:
         expected = f"at most {most} of the {len(scene.train)} training frames of {scene.name}"
         raise mismatch("data.held_out", expected, count, f"set data.held_out={most}")
     chosen = {frames[(2 * i + 1) * len(frames) // (2 * count)][1] for i in range(count)}
-    paths = {i: scene.train[i].load.path for _, i in frames if isinstance(scene.train[i].load, StoredImage)}
-    for same in same_files(paths.values()) if chosen & {*paths} else ():
-        rows = {i for i, path in paths.items() if path in same}
-        chosen |= rows if chosen & rows else set()
     train = tuple(frame for i, frame in enumerate(scene.train) if i not in chosen)
     held = tuple(scene.train[i] for i in sorted(chosen))
     return replace(scene, train=train, held=held, protocol={**scene.protocol, "held_out": count})

@@ -313,13 +313,10 @@ def _refuse_order(path: Path, cameras: Sequence[Camera], masks: Sequence[Path], 
     from scipy.optimize import linear_sum_assignment  # late: it takes long, and hardly any scene needs it
 
     every, found = range(len(cameras)), []
-    for inner in (
-        lambda k, row: k,
-        lambda k, row: row,
-    ):  # rows of poses alone in another order, or blocks, too
+    for with_blocks in (False, True):  # rows of poses alone, or blocks of Intrinsic.inf, too
         missed = np.zeros((len(cameras), len(cameras)))
         for k, row in product(every, every):
-            camera = replace(cameras[inner(k, row)], camera_to_world=cameras[row].camera_to_world)
+            camera = replace(cameras[row if with_blocks else k], camera_to_world=cameras[row].camera_to_world)
             missed[k, row] = _missed(camera, shown(k), points)
         rows = linear_sum_assignment(missed)[1].tolist()
         found.append((float(missed[every, rows].mean()), rows))
@@ -332,10 +329,11 @@ def _refuse_order(path: Path, cameras: Sequence[Camera], masks: Sequence[Path], 
     if sorted(every, key=rows.__getitem__) in texts:
         how = f"rows are in the order of cameras' numbers as texts, as 1, 10, 11, 2: {how}"
     got = f"clouds of which {1 - now:.0%} falls on the masks, and {1 - then:.0%} if {how}"
-    blocks = found[1][0] - found[0][0]  # how much worse it is with them
-    also = " and blocks of Intrinsic.inf" if blocks < -_MISSED / 2 else ""
-    also = also or ", and blocks of Intrinsic.inf if they are so, too," * (blocks < _MISSED / 2)
-    raise mismatch(path, "a row for each image in the order of their names", got, f"sort rows{also} by that")
+    worse = found[1][0] - found[0][0]  # with the blocks of Intrinsic.inf in that order, too
+    also = ", and the blocks of Intrinsic.inf"
+    also = also if worse < -_MISSED / 2 else f"{also} if they are so, too," if worse < _MISSED / 2 else ""
+    advice = f"put the rows of {path.name}{also} into the order of the images' names"
+    raise mismatch(path, "a row for each image in the order of their names", got, advice)
 
 
 def _missed(camera: Camera, mask: Tensor, points: Tensor) -> float:

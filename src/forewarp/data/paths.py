@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from itertools import pairwise
 from statistics import median
@@ -35,13 +35,14 @@ def doubt_paths(scene: Scene) -> Iterator[str]:
 
     Cost: nothing is decoded but some images on both sides of a pose that is repeated.
     """
-    everything = _of_cameras((*scene.train, *scene.held, *scene.val, *scene.test))
+    frames = {frame.name: frame for frame in (*scene.train, *scene.held, *scene.val, *scene.test)}
+    everything = _of_cameras(frames.values())  # each once, also where val is test
     still = [] if scene.has_alpha else everything  # where a background tells whether the camera moves
     for doubt, cameras in ((_out_of_order, everything), (_rounded, everything), (_repeated, still)):
         yield from filter(None, [next(filter(None, map(doubt, cameras)), None)])
 
 
-def _of_cameras(frames: Sequence[Frame]) -> list[list[Frame]]:
+def _of_cameras(frames: Iterable[Frame]) -> list[list[Frame]]:
     """Group frames by folder and camera, each in order of time, where names and number tell something."""
     folders: dict[tuple, list[Frame]] = {}
     for frame in sorted(frames, key=lambda frame: (frame.time, frame.name)):
@@ -82,10 +83,8 @@ def _out_of_order(frames: Sequence[Frame]) -> str | None:
     by_time, by_name = next(pair for pair in zip(names, orders[how]) if pair[0] != pair[1])
     line = f"the camera's path is {due / max(steps[how], _ROUNDING):.2g} times as long in the order of the"
     line += f" times as in that of the images' names{how} ({by_time} and {by_name} are the first to differ)"
-    line += (
-        f", as if {'poses were given to sorted names' if how else 'times were given to names in no order'}"
-    )
-    return f"{line}; give each image its own pose and time"
+    cause = "poses were given to sorted names" if how else "times were given to names in no order"
+    return f"{line}, as if {cause}; give each image its own pose and time"
 
 
 def _rounded(frames: Sequence[Frame]) -> str | None:
@@ -110,7 +109,10 @@ def _repeated(frames: Sequence[Frame]) -> str | None:
     """Say that images have the pose of the one before, but change as those do whose pose changes, too."""
     still, moved = [], []
     for before, after in pairwise(frames):
-        is_still = torch.equal(before.camera.camera_to_world, after.camera.camera_to_world)
+        one, other = before.camera, after.camera
+        if (one.width, one.height) != (other.width, other.height):
+            continue  # a phone that was turned
+        is_still = torch.equal(one.camera_to_world, other.camera_to_world)
         (still if is_still else moved).append((before, after))
     if min(len(still), len(moved)) < _LEAST_STEPS:
         return None

@@ -20,7 +20,6 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
-from operator import attrgetter
 from pathlib import Path
 from reprlib import repr as short
 
@@ -491,13 +490,13 @@ def _split_entries(
             parts[home] = [entry for entry in entries if entry.name not in everywhere]
         how = "as listed in the file"
         if not parts["test"] and names.get("test") and names["test"] <= absent:  # never rendered
-            parts["train"], parts["test"] = hold_out_every(parts["train"], test_every, attrgetter("path"))
+            parts["train"], parts["test"] = hold_out_every(parts["train"], test_every)
             how += f", no image of test_filenames is there: every {test_every}th training frame held out"
     else:
         if len(entries) < 3:
             advice = "take more images; of two, name one in test_filenames"
             raise mismatch(file, "at least 3 images, one of them to test on", len(entries), advice)
-        train, test = hold_out_every(entries, test_every, attrgetter("path"))
+        train, test = hold_out_every(entries, test_every)
         parts = {"train": train, "val": [], "test": test}
         how = f"every {test_every}th frame held out"
     for split in ("train", "test"):

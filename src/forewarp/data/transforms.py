@@ -13,7 +13,7 @@ import os
 import re
 from bisect import bisect_right
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -36,7 +36,7 @@ from forewarp.data.files import (
     one_of,
     side_files,
 )
-from forewarp.data.images import TURN, Header, by, exif_turned, inspect_image, refuse_other_sizes, same_files
+from forewarp.data.images import TURN, Header, by, exif_turned, inspect_image, refuse_other_sizes
 from forewarp.data.names import LEAST_SPAN, in_order, name_parts, read_names, refuse_far
 from forewarp.ops.backend import is_number
 from forewarp.scene.camera import Camera, Lens
@@ -530,29 +530,15 @@ def with_suffix(path: Path) -> Path:
     return next((candidate for candidate in named if os.path.isfile(candidate)), named[0])
 
 
-def hold_out_every(
-    things: Sequence[Thing], every: int, image: Callable[[Thing], Path] | None = None
-) -> tuple[list[Thing], list[Thing]]:
+def hold_out_every(things: Sequence[Thing], every: int) -> tuple[list[Thing], list[Thing]]:
     """Split things in the order of time: each ``every``-th is held out, the first and the last never.
-
-    Args:
-        things: of which at least one is held out of three.
-        every: as above.
-        image: the file of a thing: things whose files are the same count as one, and go together.
 
     >>> hold_out_every(range(10), 4)
     ([0, 1, 3, 4, 5, 7, 8, 9], [2, 6])
     """
-    firsts: dict[Path, Path] = {}
-    for some in same_files(map(image, things)) if image else ():
-        firsts |= dict.fromkeys(some, some[0])
-    keys = [firsts.get(image(thing), image(thing)) for thing in things] if firsts else [*range(len(things))]
-    each = [*dict.fromkeys(keys)]
-    each = each if len(each) > 2 else (keys := [*range(len(things))])
-    held = {*each[max(1, min(every // 2, len(each) - 2)) : -1 : every]}
-    return tuple(
-        [thing for thing, key in zip(things, keys) if (key in held) == is_held] for is_held in (False, True)
-    )
+    held, kept = slice(max(1, min(every // 2, len(things) - 2)), -1, every), list(things)
+    del kept[held]
+    return kept, list(things[held])
 
 
 def with_images(things: Sequence[Thing], images: Sequence[Path], where: str) -> tuple[list[Thing], list[str]]:
@@ -756,7 +742,13 @@ def _of_own_numbers(splits: Mapping[str, Mapping[str, float]], split: str, where
     train, of = ({_last_number(name): time for name, time in splits[key].items()} for key in ("train", split))
     if split == "train" or min(len(train), len(of)) < _LEAST_EVEN or {None, *train} & {*of}:
         return []
-    (number, time), (other, at) = (np.array([*some.items()]).T for some in (train, of))
+    first = min(*train, *of)
+    numbers = [[float(min(n - first, 1 << 62)) for n in some] for some in (train, of)]  # names may hold dates
+    (number, time), (other, at) = (
+        (np.array(n), np.array([*s.values()])) for n, s in zip(numbers, (train, of))
+    )
+    if not (number.std() and other.std()):
+        return []
     (rate, start), (own, _) = fits = [np.polyfit(*some, 1) for some in ((number, time), (other, at))]
     errors = [np.abs(np.polyval(fit, n) - t).max() for fit, n, t in zip(fits, (number, other), (time, at))]
     off, step = np.abs(rate * other + start - at).max(), _OWN_STEPS * abs(rate)

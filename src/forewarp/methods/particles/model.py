@@ -323,7 +323,8 @@ class Particles(Method):
             count = len(seen.view) if seen.valid is None else int(seen.valid.sum())
             squared, numbers = squared + squared_error, numbers + 3 * count
             for name, value in of_image.items():
-                terms[name] = None if value is None else terms[name] + value / views
+                before = terms[name] or 0.0  # one image may have a term that another lacks
+                terms[name] = (before or None) if value is None else before + value / views
             has_depth |= seen.sensed is not None
             for name, value in found.items():
                 gradients[name] = gradients[name] + value if name in gradients else value
