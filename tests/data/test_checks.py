@@ -568,7 +568,5 @@ def test_focal_lengths_that_images_around_a_subject_do_not_agree_with_are_doubte
     cameras = [replace(f.camera, fx=2 * f.camera.fx, fy=2 * f.camera.fy) for f in scene.train]
     wrong = tuple(replace(frame, camera=camera) for frame, camera in zip(scene.train, cameras))
     (line,) = (line for line in remarks(replace(scene, train=wrong)) if "agree" in line)
-    what = "silhouettes of " if cut_out else ""
-    assert line.startswith(
-        f"{what}neighbouring images agree much better if focal lengths are 0.5 times as long"
-    )
+    what = "silhouettes of neighbouring images" if cut_out else "images of different directions"
+    assert line.startswith(f"{what} agree much better if focal lengths are 0.5 times as long")

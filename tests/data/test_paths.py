@@ -28,6 +28,18 @@ def film(names=None, times=None, cameras=CAMERAS, images=IMAGES):
     return [*zip(names, times or [i / COUNT for i in NUMBERS], cameras, images)]
 
 
+def test_films_of_a_phone_that_was_turned_and_of_which_all_views_are_tested_are_read():
+    turned = [4 <= i < 8 for i in range(COUNT)]
+    images = [image.transpose(0, 1) if is_turned else image for image, is_turned in zip(IMAGES, turned)]
+    cameras = [CAMERAS[i - 1] if i in (4, 8) else camera for i, camera in enumerate(CAMERAS)]
+    cameras = [replace(c, width=36, height=48) if is_turned else c for c, is_turned in zip(cameras, turned)]
+    assert not said(film(cameras=cameras, images=images), "pose of the one before")
+    times = torch.randperm(COUNT, generator=torch.Generator().manual_seed(0)).tolist()
+    shuffled = tuple(Frame(*of[:3], lambda: IMAGES[0]) for of in film(times=[i / COUNT for i in times]))
+    scene = replace(SCENE, train=shuffled[::2], val=shuffled[1::2], test=shuffled[1::2], has_alpha=False)
+    assert any("path is" in line for line in doubt_paths(scene))
+
+
 def test_poses_that_follow_names_as_texts_and_times_in_no_order_are_said():
     assert not said(film(), "path")
     names = sorted(f"images/frame_{i}" for i in NUMBERS)

@@ -598,8 +598,7 @@ def _read_items(path: Path, ids: list[str]) -> tuple[dict[str, int], dict[str, i
     if takers and len({*cameras.values()}) == 1:  # a number that says nothing
         order = in_order({*takers})
         views = {item: order.index(camera) for item, camera in zip(ids, takers)}
-    is_one = key == "time_id" and len({*cameras.values()}) == 1  # a camera, whose path tells more
-    if is_one or not _counts_items(moments, named, views):
+    if not _counts_items(moments, named, views):
         return moments, cameras, []
     line = f"{path}: {key} counts the items in another order than the numbers in their names"
     if key == "time_id" or not is_sure:

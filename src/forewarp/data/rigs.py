@@ -120,4 +120,4 @@ def refuse_copied_poses(frames: Iterable[Frame], where: object) -> None:
         if float((one - two).abs().mean()) > _DIFFER * shown:
             got = f"one for {other.name} and {frame.name}, whose images differ"
             advice = "mend the pose that was copied, or the times if one camera took both"
-            raise mismatch(where, "a pose for each camera at a time", got, advice)
+            raise mismatch(where, "a pose for each camera", got, advice)
