@@ -1,3 +1,4 @@
+import json
 import shutil
 import socket
 import sys
@@ -13,7 +14,7 @@ from omegaconf import OmegaConf
 pytest.importorskip("viser", reason="no viser: pip install forewarp[viewer]")
 
 from forewarp.cli.prepare import viewer_of
-from forewarp.cli.view import refuse_other_scene, view
+from forewarp.cli.view import refuse_other_scene, view, warn_of_other_files
 from forewarp.viewer.queue import RenderQueue
 from tests.support.configs import composed
 from tests.support.tiny_scene import ball_scene
@@ -83,6 +84,25 @@ def test_two_runs_of_different_scenes_are_refused():
     ):
         with pytest.raises(ValueError, match=says):
             refuse_other_scene(scene, replace(scene, **changes))
+
+
+def test_two_runs_on_other_files_are_told(tmp_path, capsys):
+    for name, content in {
+        "a": {"texts": {"t.json": "0"}},
+        "b": {"texts": {"t.json": "1"}},
+        "old": None,
+    }.items():
+        (tmp_path / name).mkdir()
+        if content:
+            (tmp_path / name / "data.json").write_text(json.dumps(content))
+    said = [
+        warn_of_other_files(tmp_path / "a", tmp_path / other, "hand") or capsys.readouterr().err
+        for other in ("a", "old", "b")
+    ]
+    assert said[:2] == ["", ""]
+    assert said[2].startswith(
+        "warning: run2: expected a run on the files of hand that run= was trained on, but"
+    )
 
 
 @pytest.mark.slow

@@ -20,10 +20,12 @@ A run in training: forewarp-train ... viewer=true
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from signal import SIGINT
 
 from forewarp.cli.entry import command
+from forewarp.files import read_json
 from forewarp.interrupts import signal_of
 
 TOLERANCE = 1e-3  # by which two runs' test cameras may differ, of their distance to the origin
@@ -48,6 +50,7 @@ def view(config) -> None:
     scene = renderers[0].scene
     for other in renderers[1:]:
         refuse_other_scene(scene, other.scene)
+        warn_of_other_files(Path(config.run), Path(config.run2), scene.name)
     viewer = Viewer(scene, renderers, rows=config.size, trust=trust_degrees(Path(config.run)))
     title = " | ".join([scene.name, *(renderer.name for renderer in renderers)])
     folder = Path(config.run) / "videos"
@@ -89,6 +92,15 @@ def refuse_other_scene(scene, other) -> None:
     if not same:
         expected = f"run2: expected a run of the same {scene.name} as run= is"
         raise ValueError(f"{expected}, but got one with other test views")
+
+
+def warn_of_other_files(run: Path, other: Path, scene: str) -> None:
+    """Warn on stderr of a second run that was trained on other files, as another capture of this name has."""
+    files, others = (read_json(folder / "data.json") for folder in (run, other))
+    if files and others and files != others:
+        expected = f"run2: expected a run on the files of {scene} that run= was trained on"
+        advice = "where they are of another capture, the two do not compare"
+        print(f"warning: {expected}, but got one on others (see data.json); {advice}", file=sys.stderr)
 
 
 def main() -> None:
