@@ -8,7 +8,8 @@ import pytest
 from forewarp.metrics import registry
 from forewarp.metrics.registry import METRICS, Metric, metric_of
 from forewarp.report.choices import compare
-from forewarp.report.results import read_compared
+from forewarp.report.results import Runs, read_compared, read_runs
+from forewarp.report.stored import read_stored, stored_csv
 from tests.support.runs_on_disk import write_run, write_views
 
 
@@ -85,6 +86,29 @@ def test_other_scenes_have_no_difference_and_other_kinds_of_view_no_metrics(ok, 
     assert why == "no differences: the runs are of different scenes"
     last = ok("report", "kind=compare", "runs=[ball/*,cone/*]").out.splitlines()[-1]
     assert last.endswith("measured in all runs (ball/base-1.0-seed0: all; cone/base-1.0-seed0: space)")
+
+
+def test_scenes_of_one_name_and_other_files_are_told_apart_where_files_are_known(in_tmp):
+    scores = {"one": 0, "two": 1, "three": 0, "old": 1}
+    folders = {name: write_run(name, seed=seed, metrics=of("forward")) for name, seed in scores.items()}
+    for name in ("one", "two", "three"):
+        (folders[name] / "data.json").write_text(
+            json.dumps({"texts": {"a.json": "0" if name == "one" else "1"}})
+        )
+
+    def said(first, second):
+        groups = read_compared([folders[first], folders[second]])
+        return len(groups), compare(groups).caption
+
+    apart = "no differences: the runs are of different scenes"
+    assert said("one", "two") == (2, apart)
+    assert apart not in said("one", "old")[1]
+    assert said("two", "three")[0] == 1  # seeds of one
+    runs = read_runs(in_tmp)[0]
+    assert sorted(map(len, runs.by("scene").values())) == [1, 1, 2]
+    stored = in_tmp / "stored.csv"
+    stored.write_text(stored_csv(Runs(row for row in runs if row["files"])))
+    assert sorted(map(len, read_stored(stored).by("scene").values())) == [1, 2]
 
 
 @pytest.mark.slow

@@ -19,6 +19,7 @@ from forewarp.report.paper import (
     comparison,
     incomplete,
     measured,
+    read_measured,
     read_paper,
     stand_in,
     with_means,
@@ -281,6 +282,18 @@ def test_runs_of_no_table_are_said_to_be_left_out(tmp_path, capsys):
     line = "mine, 2 runs: not in any table of the paper; use kind=compare or kind=accuracy_time"
     assert capsys.readouterr().out == f"{line}\n"
     assert f"* {line}\n" in (tmp_path / "out" / "paper.md").read_text().split("## Left out")[1]
+
+
+def test_runs_on_other_files_than_most_are_left_out_by_name(tmp_path):
+    folders = [
+        paper_run(tmp_path, "hook", warp=warp) for warp in ("forward", "particles", "backward", "nerfies")
+    ]
+    for folder, files in zip(folders, "aab"):  # the last is of an earlier version, which stored none
+        (folder / "data.json").write_text(json.dumps({"texts": {"transforms_train.json": files}}))
+    runs, left_out = read_measured(tmp_path, read_paper(PAPER).values())
+    assert [row["method"] for row in runs] == ["forward", "nerfies", "particles"]
+    assert {row["scene"] for row in runs} == {"hook"}
+    assert re.fullmatch(r"hook \(files \w{8}\): 1 run; most of hook are of others", *left_out)
 
 
 @pytest.mark.slow

@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import math
 import re
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain, product
@@ -22,7 +23,7 @@ from forewarp.media import image_bytes
 from forewarp.metrics.registry import metric_of
 from forewarp.report import figures, motion_figures
 from forewarp.report.results import KINDS, Point, Row, Runs, nothing, refused
-from forewarp.report.settings import grouped
+from forewarp.report.settings import grouped, scene_of
 from forewarp.report.statistics import INTERVALS, LEAST, Estimate, by_chance, paired_change, rank, verdict
 from forewarp.report.stored import UNPAIRED, read_any, stored_csv
 from forewarp.report.tables import MARKED, Cell, Column, Difference, Section, Table, rendered
@@ -383,7 +384,7 @@ def write_paper(
         curves: folder of the pictures drawn by ``kind=accuracy_time``, shown too.
     """
     paper = read_paper(published or PAPER).values()
-    runs, left_out = _read(folder, paper)
+    runs, left_out = read_measured(folder, paper)
     if not runs:
         raise nothing(
             folder, runs, left_out, "runs with a metrics.json", "make some with make reproduce-tables"
@@ -422,12 +423,23 @@ def write_paper(
     return [*(out / f"paper.{kind}" for kind in ("md", "html", "tex")), *files, *figure_files]
 
 
-def _read(folder: Path, tables: Iterable[PaperTable]) -> tuple[Runs, list[str]]:
-    """Read the measured runs, and a line for each other run.
+def read_measured(folder: Path, tables: Iterable[PaperTable]) -> tuple[Runs, list[str]]:
+    """Read the measured runs, and a line for each other run, also of scenes of other files than most runs of
+    that name have.
 
     A protocol names the kind of test view that is shown where columns of ``tables`` name none.
     """
     runs, left_out = read_any(folder)
+    for same in grouped(((run["dataset"], scene_of(run)), run) for run in runs).values():
+        named = Counter(run["scene"] for run in same if run["scene"] != scene_of(run))
+        for name, count in named.most_common()[1:]:
+            left_out.append(
+                f"{name}: {count} run{'s' * (count > 1)}; most of {scene_of(same[0])} are of others"
+            )
+            print(left_out[-1])
+            runs = Runs(run for run in runs if run["scene"] != name or run["dataset"] != same[0]["dataset"])
+    for run in runs:
+        run["scene"] = scene_of(run)
     open_kind = {group.dataset for table in tables for group in table.groups if group.ability is None}
     for run in runs:
         run.setdefault("late", late_gain(run["points"]))
@@ -597,7 +609,7 @@ def write_ablation(folder: Path, out: Path, published: Path | None = None) -> li
         ValueError: if no run is of an ablation.
     """
     paper = read_paper(published or PAPER).values()
-    runs, left_out = _read(folder, paper)
+    runs, left_out = read_measured(folder, paper)
     # Tables that take the method apart; a table scene by scene repeats another.
     tables = [table for table in paper if not table.means and len(table.parts) > 1]
     known, read = {row.variant for table in tables for row in table.parts}, runs

@@ -53,7 +53,7 @@ DESCRIBED = "described"  # column of what tables need to know of other packages'
 SCORES = ("psnr", "ssim", "lpips")  # that a table has, whether measured or not
 NUMBERS = ("steps", "step", "frame", "parameters", "memory", "ends", "motion_error")
 NUMBERS += ("psnr_space", "psnr_time", "psnr_canonical", "size", "wall", "processor")
-TEXTS = ("dataset", "day", "commit", "departures", "faults", "views", "curve", "command", "note")
+TEXTS = ("dataset", "day", "commit", "departures", "faults", "views", "curve", "command", "files", "note")
 # Kinds of test view, and parts of their pixels, that scores are of.
 KINDS = {"space": "at training times", "time": "between training times", "canonical": "at the canonical time"}
 KINDS |= {"space_time": "of cameras and between times held out", "all": "all"}
@@ -348,6 +348,8 @@ def read_run(folder: Path) -> Row:
     planned = (row["plan"] or {}).get("overrides") or ()
     row["configuration"] = configuration(config, read_json(folder / "data.json"), planned)
     row["digest"] = digest_of(row["configuration"])
+    is_recipe = any(key.startswith("data.synthesis.") for key in row["configuration"])  # which counts
+    row["files"] = None if is_recipe else row["configuration"].get("data.files")
     row |= {"about": variant.get("about", ""), "against": variant.get("against")}
     row |= {"scene": str(config["data"]["scene"]), "seed": int(config["seed"])}
     row |= {"minutes": budget["minutes"], "iterations": budget.get("iterations")}

@@ -172,8 +172,26 @@ def typed(command: str) -> dict[str, str]:
     return {key: word for key, word in counted.items() if not key.startswith(("-", "hydra."))}
 
 
+def scene_of(row: Row) -> str:
+    """Return the scene's name without what ``name_scenes`` adds."""
+    return row["scene"].removesuffix(f" (files {row.get('files')})")
+
+
+def name_scenes(rows: Iterable[Row]) -> None:
+    """Add the digest of its ``files`` to the name of a scene that other rows have of other files, as two
+    captures of one name are other scenes. Rows that lack it, as those of earlier versions, keep the name.
+    """
+    for same in grouped(((row.get("dataset"), scene_of(row)), row) for row in rows).values():
+        several = len({row.get("files") for row in same} - {None}) > 1
+        for row in same:
+            row["scene"] = scene_of(row) + (
+                f" (files {row['files']})" if several and row.get("files") else ""
+            )
+
+
 def name_settings(rows: Sequence[Row]) -> None:
-    """Give rows their ``overrides``, ``setting``, ``words`` and ``variant``.
+    """Give rows their ``overrides``, ``setting``, ``words`` and ``variant``, and other scenes other names
+    (``name_scenes``).
 
     ``overrides`` has the typed overrides that count and, where two configurations would share these under the
     same conditions, more keys. ``setting`` is that without what all rows share on each scene, and does not
@@ -184,6 +202,7 @@ def name_settings(rows: Sequence[Row]) -> None:
     A row of a CSV file has no ``configuration``: the ``overrides`` stored there tell, or else its command.
     Rows of the same words with another ``digest`` are named by their experiments, or else by the digest.
     """
+    name_scenes(rows)
     words: dict[int, dict[str, str]] = {}
     for family in grouped((family_of(row), row) for row in rows).values():
         words |= _overrides(family)

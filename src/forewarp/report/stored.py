@@ -19,7 +19,7 @@ from forewarp.report.settings import name_settings
 
 TEXTS = ("scene", "variant", "ablation", "against", "about", "method", "preset", "ability", "effects")
 TEXTS += ("clock", "device", "torch", "measured", "pictures", "dataset", "origin", "protocol", "day", "curve")
-TEXTS += ("image_format", "command")
+TEXTS += ("image_format", "command", "files")
 # Column of the kinds of test view, or other columns, of which it is not known which seed has which value.
 UNPAIRED = "unpaired"
 WHOLE = ("seed", "iterations", "held_out", "train_views", "tested", "counterpart", "steps")

@@ -82,6 +82,8 @@ def measure_elsewhere(config: DictConfig) -> dict:
     options = {"protocol": protocol, "minutes": config.minutes, "sheets": config.sheets}
     with locked(folder), Counted("test views") as progress:
         metrics = measure_renders(datamodule, files, folder, suite, progress=progress, **options)
+        if (files := datamodule.fingerprint()) is not None:
+            write_json(folder / "data.json", files)
         replace_file(folder / "config.yaml", OmegaConf.to_yaml(OmegaConf.create(stored)))
     show(metrics, folder)
     return metrics
