@@ -33,10 +33,19 @@ EFFECTS = [(name, effect) for name in METHODS for effect in METHODS[name].effect
 each_effect = pytest.mark.parametrize(("name", "effect"), EFFECTS)
 
 
+def mostly_slow(name, dataset="dnerf"):
+    """One method on one dataset is tested by the quick tests, too."""
+    return () if (name, dataset) == ("particles", "dnerf") else pytest.mark.slow
+
+
+each_mostly_slow = pytest.mark.parametrize("name", [pytest.param(n, marks=mostly_slow(n)) for n in METHODS])
+
+
 def on(datasets):
     """Every method on every dataset."""
     pairs = [(name, dataset) for name in METHODS for dataset in datasets]
-    return pytest.mark.parametrize(("name", "dataset"), pairs)
+    params = [pytest.param(*pair, marks=mostly_slow(*pair), id="-".join(pair)) for pair in pairs]
+    return pytest.mark.parametrize(("name", "dataset"), params)
 
 
 def assert_equal_states(one, other):
@@ -66,7 +75,6 @@ def test_its_loss_falls(name, dataset, fitted):
     assert last < METHODS[name].falls * first
 
 
-@pytest.mark.slow
 @on(DATASETS)
 def test_a_checkpoint_gives_the_same_pictures(name, dataset, fitted):
     found = fitted(name, dataset)
@@ -83,7 +91,6 @@ def data_camera(found):
     return found.run.datamodule.scene.train[1].camera
 
 
-@pytest.mark.slow
 @on(DATASETS)
 def test_any_time_can_be_rendered(name, dataset, fitted):
     found = fitted(name, dataset)
@@ -104,7 +111,6 @@ def test_any_time_can_be_rendered(name, dataset, fitted):
             assert drawn.opacity.amax() > 0.05  # something is there
 
 
-@pytest.mark.slow
 @on(DATASETS)
 def test_pixels_and_crops_are_parts_of_the_whole_picture(name, dataset, fitted):
     found = fitted(name, dataset)
@@ -119,8 +125,7 @@ def test_pixels_and_crops_are_parts_of_the_whole_picture(name, dataset, fitted):
             torch.testing.assert_close(getattr(part, key), expected, atol=1e-5, rtol=1e-5)
 
 
-@pytest.mark.slow
-@each
+@each_mostly_slow
 def test_gradients_and_all_terms_are_finite(name, scenes):
     data, entry = data_of("dnerf", scenes), METHODS[name]
     terms = module_of(entry, data).method.terms
@@ -133,8 +138,7 @@ def test_gradients_and_all_terms_are_finite(name, scenes):
     assert all(torch.tensor(value).isfinite() for value in raw.values())
 
 
-@pytest.mark.slow
-@each
+@each_mostly_slow
 def test_every_parameter_has_one_rate(name, scenes):
     module = module_of(METHODS[name], data_of("dnerf", scenes))
     grouped = [id(p) for group in module.method.param_groups().values() for p in group]
@@ -142,8 +146,7 @@ def test_every_parameter_has_one_rate(name, scenes):
     assert sum(len(g["params"]) for g in module.configure_optimizers().param_groups) == len(grouped)
 
 
-@pytest.mark.slow
-@each
+@each_mostly_slow
 def test_a_term_of_weight_zero_is_never_called(name, scenes):
     data, entry = data_of("dnerf", scenes), METHODS[name]
     terms = module_of(entry, data).method.terms
@@ -199,8 +202,7 @@ def straight(scenes, tmp_path_factory):
     return fit
 
 
-@pytest.mark.slow
-@each
+@each_mostly_slow
 def test_two_runs_of_one_seed_are_equal(name, straight, scenes, tmp_path):
     torch.manual_seed(5)  # nothing that was drawn before matters
     again = run_of([stage_of(METHODS[name], steps=STEPS)], data_of("dnerf", scenes), tmp_path).fit()

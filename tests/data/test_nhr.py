@@ -331,5 +331,5 @@ def test_rows_in_another_order_than_images_are_told_by_clouds(tmp_path, files, a
             rows = [re.sub(r"^\d+", str(k), row) for k, row in enumerate(rows)]
         path.write_text(end.join(rows) + end)
     said = "if rows are in the order of cameras' numbers as texts, as 1, 10, 11, 2: row 4 is of img_0002.jpg"
-    with refused(f"CamPose.inf: expected a row for .*, and 100% {said}.*; put the rows of CamPose.inf{also} into"):
+    with refused(f"expected a row for .*, and 100% {said}.*; put the rows of CamPose.inf{also} into"):
         read_scene(tmp_path, "toy")
