@@ -8,6 +8,7 @@ from __future__ import annotations
 import io
 import subprocess
 import warnings
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO
 
@@ -17,10 +18,11 @@ import numpy as np
 from forewarp.files import MOST_FILM, MOST_IMAGE, check_size, read_bytes
 
 if TYPE_CHECKING:
-    from PIL import Image
+    from PIL import Image, ImageCms
 
 MOST_PIXELS = 80_000_000  # of an image and of a film's frame; Pillow warns a little above
 MOST_DRAWN = 40_000_000  # pixels of an image that a run has drawn, which is read as float32
+_SAME_COLORS, _PROFILES = 3, 16  # of 255, by which profiles that are sRGB may differ; kept conversions
 FORMATS = ("PNG", "JPEG")
 # ffmpeg's readers of films; others, such as those of playlists, open more than the file.
 _CONTAINERS = (
@@ -53,6 +55,38 @@ def open_image(stream: BinaryIO, most: int = MOST_PIXELS) -> Image.Image:
     if not 0 < image.width * image.height <= most:
         raise TooManyPixels(f"{image.width} x {image.height}")
     return image
+
+
+def in_srgb(image: Image.Image, mode: str) -> Image.Image:
+    """Convert an open image to one of Pillow's modes; RGB and RGBA to sRGB's colours, where its ICC profile,
+    such as Display P3, has others. One that cannot be read, or is not of RGB, counts as sRGB.
+    """
+    from PIL import ImageCms
+
+    converted, transform = image.convert(mode), None
+    if mode in ("RGB", "RGBA") and (profile := image.info.get("icc_profile")):
+        transform = _to_srgb(profile, mode)
+    if transform is not None:
+        ImageCms.applyTransform(converted, transform, inPlace=True)
+    return converted
+
+
+@lru_cache(_PROFILES)
+def _to_srgb(profile: bytes, mode: str) -> ImageCms.ImageCmsTransform | None:
+    """Make the conversion of colours of an ICC profile to sRGB; None where it changes next to nothing."""
+    from PIL import Image, ImageCms
+
+    colors = np.stack(np.meshgrid(*3 * [np.arange(0, 256, 17, dtype=np.uint8)]), -1).reshape(1, -1, 3)
+    grid = Image.fromarray(colors).convert(mode)
+    try:
+        source = ImageCms.ImageCmsProfile(io.BytesIO(profile))
+        intent = ImageCms.Intent.RELATIVE_COLORIMETRIC
+        transform = ImageCms.buildTransform(source, ImageCms.createProfile("sRGB"), mode, mode, intent)
+        changed = np.asarray(ImageCms.applyTransform(grid, transform))
+    except Exception:  # PyCMSError, OSError and more, of a harmed profile
+        return None
+    apart = np.abs(changed[..., :3].astype(int) - colors).max()
+    return transform if apart > _SAME_COLORS else None
 
 
 def read_rgb(path: Path) -> np.ndarray:

@@ -2,12 +2,14 @@
 
 import gc
 import mmap
+import struct
 
 import imageio.v3 as iio
 import numpy as np
 import pytest
 import torch
 from PIL import Image
+from PIL.ImageCms import ImageCmsProfile, createProfile
 
 from forewarp.data.files import SceneError
 from forewarp.data.images import (
@@ -261,6 +263,43 @@ def test_a_jpeg_with_a_second_image_inside_is_turned_as_others(tmp_path):
     header = inspect_image(tmp_path / "a.jpg")
     assert (header.size, header.is_turned) == ((53, 37), True)
     assert read_image(tmp_path / "a.jpg", upright=True).shape == (53, 37, 4)
+
+
+def p3_profile():
+    """Make the ICC profile Display P3, as phones write it."""
+    fixed = lambda *values: b"".join(struct.pack(">i", round(v * 65536)) for v in values)  # noqa: E731
+    name = b"Display P3\0"
+    red, green, blue = (0.5151, 0.2412, -0.00105), (0.29197, 0.69224, 0.04188), (0.15716, 0.06658, 0.78438)
+    curve = b"para\0\0\0\0\0\3\0\0" + fixed(2.4, 1 / 1.055, 0.055 / 1.055, 1 / 12.92, 0.04045)
+    tags = {
+        b"desc": b"desc\0\0\0\0" + struct.pack(">I", len(name)) + name + bytes(78),
+        b"cprt": b"text\0\0\0\0public domain\0",
+        b"wtpt": b"XYZ \0\0\0\0" + fixed(0.9642, 1, 0.8249),
+        **{b"rgb"[i : i + 1] + b"XYZ": b"XYZ \0\0\0\0" + fixed(*v) for i, v in enumerate((red, green, blue))},
+        **{b"rgb"[i : i + 1] + b"TRC": curve for i in range(3)},
+    }
+    table, body = struct.pack(">I", len(tags)), b""
+    for tag, value in tags.items():
+        table += tag + struct.pack(">II", 132 + 12 * len(tags) + len(body), len(value))
+        body += value + bytes(-len(value) % 4)
+    head = struct.pack(">III", 128 + len(table + body), 0, 0x04000000) + b"mntrRGB XYZ "
+    head += struct.pack(">6H", 2022, 1, 1, 0, 0, 0) + b"acsp" + bytes(28) + fixed(0.9642, 1, 0.8249)
+    return head.ljust(128, b"\0") + table + body
+
+
+@pytest.mark.parametrize("suffix", [".png", ".jpg"])
+def test_colours_of_another_profile_become_srgb(tmp_path, suffix):
+    # Saturated sRGB red, a skin's colour and grey, as Display P3 has them (CSS Color 4).
+    seen = np.array([[255, 0, 0], [200, 120, 100], [90, 90, 90]])
+    stored = np.array([[234, 51, 35], [190, 124, 105], [90, 90, 90]], np.uint8)
+    pixels = np.repeat(stored, 16, 0)[None].repeat(16, 0)
+    srgb = ImageCmsProfile(createProfile("sRGB")).tobytes()
+    options = {"subsampling": 0} if suffix == ".jpg" else {}
+    for profile, expected in ((p3_profile(), seen), (srgb, stored), (b"x" * 200, stored)):
+        Image.fromarray(pixels).save(path := tmp_path / f"a{suffix}", icc_profile=profile, **options)
+        found = read_image(path)[8, 8::16]
+        assert np.abs(found[:, :3].numpy().astype(int) - expected).max() <= 4
+    assert found[:, 3].eq(255).all()
 
 
 def films(folder, suffix, images):

@@ -23,7 +23,7 @@ from torch import Tensor
 from forewarp.clock import left_out
 from forewarp.data.files import SceneError, mismatch, number, one_of, opened, read_bytes
 from forewarp.files import MOST_IMAGE, written_whole
-from forewarp.media import MOST_PIXELS, TooManyPixels, open_image
+from forewarp.media import MOST_PIXELS, TooManyPixels, in_srgb, open_image
 from forewarp.ops.grid import block_means, block_sums
 from forewarp.scene.frame import spread
 
@@ -227,7 +227,7 @@ def common_header(paths: Iterable[Path], one_size: bool = True) -> tuple[Header,
 
 
 def read_image(path: Path, size: tuple[int, int] | None = None, *, upright: bool = False) -> Tensor:
-    """Decode a PNG or JPEG: uint8 (H, W, 4), straight alpha; without an alpha channel it is 255.
+    """Decode a PNG or JPEG: uint8 (H, W, 4), straight alpha, in sRGB; without an alpha channel it is 255.
 
     Args:
         path: of the image.
@@ -604,7 +604,7 @@ def _decode(path: Path, mode: str, upright: bool = False) -> np.ndarray:
     try:
         # In one expression: while a name keeps the image alive, its memory is not used again.
         turn = ImageOps.exif_transpose if upright else (lambda image: image)
-        return np.array(turn(open_image(content)).convert(mode))
+        return np.array(in_srgb(turn(open_image(content)), mode))
     except Exception as error:  # decoders raise OSError, SyntaxError, struct.error and more
         raise mismatch(path, "an image", f"data that cannot be decoded ({error})") from error
 

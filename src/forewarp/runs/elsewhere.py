@@ -21,7 +21,7 @@ from forewarp.data.names import in_order
 from forewarp.drawing.images import error_colors, write_png
 from forewarp.evaluation.evaluate import from_training, middles, show, write_sheet
 from forewarp.files import MOST_IMAGE, load_yaml, read_bytes, refuse_links, replace_file, write_json
-from forewarp.media import open_image
+from forewarp.media import in_srgb, open_image
 from forewarp.metrics.lpips import find_lpips
 from forewarp.metrics.registry import ImageSuite, absences, described, scores_of_parts, summarise
 from forewarp.progress import Counted
@@ -144,7 +144,7 @@ def read_render(file: Path, target: Target) -> Tensor:
     try:
         image = open_image(io.BytesIO(read_bytes(file, MOST_IMAGE)))
         mode, kind = image.mode, image.format
-        pixels = np.array(image.convert("RGBA"))
+        pixels = np.array(in_srgb(image, "RGBA"))
     except (OSError, SyntaxError, ValueError) as error:
         raise mismatch(file, "a PNG image", f"another file ({error})", "write it anew") from error
     if kind != "PNG" or mode not in ("RGB", "RGBA", "P", "L", "LA"):
