@@ -9,7 +9,7 @@ from forewarp.fields.curves import Curve
 from forewarp.methods.particles.deformation import Deformation
 from forewarp.methods.particles.model import Particles
 from forewarp.methods.particles.nodes import Nodes
-from forewarp.methods.particles.regularizers import REGULARIZERS, Regularized, regularize, static
+from forewarp.methods.particles.regularizers import REGULARIZERS, RegularizerInput, regularize, static
 from tests.contract.fitting import module_of
 from tests.contract.table import METHODS
 from tests.support.particles import BARE, MOVING, look, module_with, shaken, small_data
@@ -65,7 +65,7 @@ def test_nodes_are_pulled_to_their_mean_place_by_a_force_that_does_not_grow(kind
     motion = nodes.motion_and_maps(nodes.curve(0.5))[0].detach()
     times = torch.linspace(0.0, 1.0, 16).tolist()
     mean = sum(nodes.motion_and_maps(nodes.curve(time))[0].detach() for time in times) / 16
-    seen = Regularized(None, Deformation(nodes, nodes.positions), motion, 2.0)
+    seen = RegularizerInput(None, Deformation(nodes, nodes.positions), motion, 2.0)
     pull = partial(regularize, {"static": static}, {"static": 5.0}, parameters=[])
     values, by_motion, _ = pull(seen)
     sizes = [(motion - mean)[:, :3] / 2.0, nodes.spacing[:, None] * (motion - mean)[:, 3:]]

@@ -17,7 +17,7 @@ _TIMES = 16  # at which motion is looked at
 _FOLLOWS = 1e-3  # weight of a node below which its motion shows nowhere
 
 
-class NodesNow(NamedTuple):
+class NodeState(NamedTuple):
     """Nodes at the ``time`` of an image, which shows ``motion_time`` of the motion: the curve's ``basis``
     (K,), ``motion`` (M, 6 or 7) and ``maps`` (M, 12) as of ``ops.nodes``.
     """
@@ -62,17 +62,17 @@ class Deformation(nn.Module):
         """Return how all Gaussians move with maps (M, 12) of nodes."""
         return Warp(maps, self.skinning.links, self.skinning.weights())
 
-    def at(self, time: float) -> NodesNow:
+    def at(self, time: float) -> NodeState:
         """Move nodes to the time of a training image, which is seen from now on."""
         nodes = self.nodes
         motion_time = nodes.motion_time(time)
         nodes.extend(motion_time)
         basis = nodes.summed_basis((motion_time, 1.0))
-        return NodesNow(time, motion_time, basis, *nodes.motion_and_maps(basis))
+        return NodeState(time, motion_time, basis, *nodes.motion_and_maps(basis))
 
     def gradients(
         self,
-        now: NodesNow,
+        now: NodeState,
         by_maps: Tensor,
         factors: Mapping[str, float],
         extent: float,
@@ -142,7 +142,7 @@ class Deformation(nn.Module):
         self.skinning.release(free)
 
 
-def standing(means: Tensor) -> Warp:
+def identity_warp(means: Tensor) -> Warp:
     """Return the warp of Gaussians (N, 3) that never move."""
     zero = means.new_zeros(len(means), 1)
     return Warp(means.new_zeros(1, 12), zero.int(), zero)

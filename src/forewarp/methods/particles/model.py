@@ -17,14 +17,14 @@ from forewarp.fields.moving import GaussiansSnapshot, MovingGaussians, NodeMotio
 from forewarp.losses import IMAGE_LOSSES, robust
 from forewarp.methods.method import Method, Snapshot, Start, Step, value_at
 from forewarp.methods.particles import exposure
-from forewarp.methods.particles.deformation import Deformation, standing
+from forewarp.methods.particles.deformation import Deformation, identity_warp
 from forewarp.methods.particles.density import DensityControl
 from forewarp.methods.particles.films.contact import known_depth, place_on_ground
 from forewarp.methods.particles.films.tracking import body_tracking
 from forewarp.methods.particles.gaussians import GaussianModel, coefficients
 from forewarp.methods.particles.nodes import Nodes, Skinning, TimeOffsets, are_rows
 from forewarp.methods.particles.options import EFFECTS, SMALLEST, Effects, Numbers, view_share
-from forewarp.methods.particles.regularizers import REGULARIZERS, Regularized, Regularizer, regularize
+from forewarp.methods.particles.regularizers import REGULARIZERS, Regularizer, RegularizerInput, regularize
 from forewarp.methods.particles.start import at_rest, compile_kernels, first_values, fresh_values
 from forewarp.methods.particles.windows import begin_window, check_still
 from forewarp.methods.rows import RowsAdam, keep_rows, take_rows
@@ -297,7 +297,7 @@ class Particles(Method):
     def warp(self, time: float) -> Warp:
         """Return how all Gaussians move from the canonical state to a time."""
         if self.deformation is None:
-            return standing(self.gaussians.means)
+            return identity_warp(self.gaussians.means)
         nodes = self.deformation.nodes
         motion, maps = nodes.motion_and_maps(nodes.basis(time))
         if self.is_led:
@@ -365,7 +365,7 @@ class Particles(Method):
         time, gaussians = self._jittered(seen.moment.time, generator), self.gaussians
         deformation, now, is_led = self.deformation, None, self.is_led
         if deformation is None:
-            warp = standing(gaussians.means)
+            warp = identity_warp(gaussians.means)
         else:
             now = deformation.at(time)
             if is_led:
@@ -396,7 +396,7 @@ class Particles(Method):
         values, by_motion, by_name = regularize(
             {name: function for name, function in self.regularizers.items() if name in factors},
             factors,
-            Regularized(gaussians, deformation, None if now is None else now.motion, extent),
+            RegularizerInput(gaussians, deformation, None if now is None else now.motion, extent),
             self.named_parameters(),
         )
         terms |= values

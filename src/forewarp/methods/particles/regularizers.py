@@ -18,7 +18,7 @@ from forewarp.methods.particles.gaussians import GaussianModel
 _REST = 3e-3  # share of the scene's extent below which nodes are pulled to rest with less than full force
 
 
-class Regularized(NamedTuple):
+class RegularizerInput(NamedTuple):
     """What a regulariser may look at; gradients go to all parameters in it, and to ``motion``.
 
     Attributes:
@@ -34,10 +34,10 @@ class Regularized(NamedTuple):
     extent: float
 
 
-Regularizer = Callable[[Regularized], Tensor | None]  # returns (), or None where what it measures is off
+Regularizer = Callable[[RegularizerInput], Tensor | None]  # returns (), or None where what it measures is off
 
 
-def static(seen: Regularized) -> Tensor | None:
+def static(seen: RegularizerInput) -> Tensor | None:
     """Measure how far nodes are from where they are on average over the times seen; its force does not grow
     with their distance: it holds what images say little about, and gives way where they say more.
 
@@ -61,7 +61,7 @@ REGULARIZERS: Mapping[str, Regularizer] = {"static": static}
 def regularize(
     regularizers: Mapping[str, Regularizer],
     factors: Mapping[str, float],
-    seen: Regularized,
+    seen: RegularizerInput,
     parameters: Iterable[tuple[str, nn.Parameter]],
 ) -> tuple[dict[str, float | None], Tensor | None, dict[str, Tensor]]:
     """Compute regularisers, and the gradients of their weighted sum.
