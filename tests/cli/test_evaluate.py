@@ -16,6 +16,7 @@ def test_images_from_elsewhere_are_a_row_of_every_report(fitted, ok, refused, in
     own, there = (json.loads((run / "metrics.json").read_text()) for run in (fitted, folder))
     kinds = {kind: scores["psnr"] for kind, scores in own["test"].items()}
     assert {kind: scores["psnr"] for kind, scores in there["test"].items()} == kinds
+    assert json.loads((folder / "data.json").read_text()) == json.loads((fitted / "data.json").read_text())
     (row,), left_out = read_runs(in_tmp / "runs")
     assert (row["method"], row["preset"], row["minutes"]) == (ELSEWHERE[0][5:], "rendered elsewhere", 20)
     assert (row["variant"], row["device"], left_out) == (
