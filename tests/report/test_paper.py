@@ -293,7 +293,7 @@ def test_runs_on_other_files_than_most_are_left_out_by_name(tmp_path):
     runs, left_out = read_measured(tmp_path, read_paper(PAPER).values())
     assert [row["method"] for row in runs] == ["forward", "nerfies", "particles"]
     assert {row["scene"] for row in runs} == {"hook"}
-    assert re.fullmatch(r"hook \(files \w{8}\): 1 run; most of hook are of others", *left_out)
+    assert re.fullmatch(r"hook \(files \w{8}\): 1 run; most runs of hook are of other files", *left_out)
 
 
 @pytest.mark.slow

@@ -221,9 +221,8 @@ def _rows(file: Path) -> list[list[str]]:
             if not line.strip() or line.lstrip()[0] == "#":
                 continue
             rows.append(line.split(maxsplit=9))
-            points = next(numbered, (0, ""))[1].split(
-                maxsplit=10
-            )  # of each three numbers; the line may be empty
+            second = next(numbered, (0, ""))[1]  # three numbers for each point; it may be empty
+            points = second.split(maxsplit=10)
             if len(points) == 10 or (len(points) > 10 and not _is_number(points[10].split()[-1])):
                 expected = "two lines an image (the second may be empty)"
                 got = f"poses in line {number} and {number + 1}"

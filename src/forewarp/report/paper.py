@@ -433,9 +433,8 @@ def read_measured(folder: Path, tables: Iterable[PaperTable]) -> tuple[Runs, lis
     for same in grouped(((run["dataset"], scene_of(run)), run) for run in runs).values():
         named = Counter(run["scene"] for run in same if run["scene"] != scene_of(run))
         for name, count in named.most_common()[1:]:
-            left_out.append(
-                f"{name}: {count} run{'s' * (count > 1)}; most of {scene_of(same[0])} are of others"
-            )
+            of_others = f"most runs of {scene_of(same[0])} are of other files"
+            left_out.append(f"{name}: {count} run{'s' * (count > 1)}; {of_others}")
             print(left_out[-1])
             runs = Runs(run for run in runs if run["scene"] != name or run["dataset"] != same[0]["dataset"])
     for run in runs:

@@ -184,9 +184,8 @@ def name_scenes(rows: Iterable[Row]) -> None:
     for same in grouped(((row.get("dataset"), scene_of(row)), row) for row in rows).values():
         several = len({row.get("files") for row in same} - {None}) > 1
         for row in same:
-            row["scene"] = scene_of(row) + (
-                f" (files {row['files']})" if several and row.get("files") else ""
-            )
+            digest = f" (files {row['files']})" if several and row.get("files") else ""
+            row["scene"] = scene_of(row) + digest
 
 
 def name_settings(rows: Sequence[Row]) -> None:
