@@ -108,7 +108,7 @@ def measured(viewer: Viewer, browser, address: str) -> list[list[str]]:
     pictures = (session.rendered - drawn) / (time.perf_counter() - begun)
     session.play(False)
     tab.settled()
-    rows.append(["frames a second while exact pictures play", f"{shown:.0f}, with {pictures:.1f} pictures"])
+    rows.append(["frames a second while exact images play", f"{shown:.0f}, with {pictures:.1f} images"])
     tab.choose("show", "splats")
     until(lambda: "drawn by the browser" in tab.status())
     tab.page.wait_for_timeout(2000)
@@ -143,7 +143,7 @@ def main() -> None:
     viewers = [viewer_of(run) for run in given.runs]
     exact = exact_table(viewers)
     drawable = [viewer for viewer in viewers if SPLATS in viewer.channels]
-    tables = {"exact pictures": exact} | ({"the page": page_table(drawable[0])} if drawable else {})
+    tables = {"exact images": exact} | ({"the page": page_table(drawable[0])} if drawable else {})
     if not given.print:
         for name, text in tables.items():
             replace_section(project_root() / "docs" / "results" / "performance.md", name, text)
